@@ -122,7 +122,7 @@ class CommonModeFilter(LinearFilter):
         return Modes(measured.detectors[:, rows], measured.times, scale)
 
     def _inside(self, observation: Observation) -> Inside | None:
-        return self.mask.of(observation) if self.mask else None
+        return self.mask.of_modes(observation, self.label) if self.mask else None
 
     def measure(self, stream: Stream, model: Modes | None = None) -> Modes:
         """Find the modes; given those of the complete signal (``model``), their times in this

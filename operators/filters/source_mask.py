@@ -12,6 +12,7 @@ what is removed, b - F b, is found outside of the mask and is subtracted inside 
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -44,8 +45,20 @@ RADIUS = math.radians(1 / 60)
 """Of a disc, where none is given."""
 ENOUGH = 256
 """Instants of a look at a scan from which it is judged whether a mask covers it."""
+MUCH = 0.2
+"""Share of the samples in a mask from which a filter of each detector's scan has too little to go
+by: drifts are guessed across the mask.
+"""
 MASKED = "samples in the source mask, not used to find what is removed"
 """A count of the log."""
+
+
+SMALLER = "choose a smaller mask"
+
+
+def _percent(share: float) -> str:
+    """A share to a twentieth: looks at different instants say the same."""
+    return f"about {max(5 * round(20 * share), 1)} %"
 
 
 class SourceMask(Parameters):
@@ -78,7 +91,8 @@ class SourceMask(Parameters):
         return self
 
     def of_part(self, observation: Observation, label: str) -> Inside:
-        """Samples of a scan that are inside; some must be outside.
+        """Samples of a scan that are inside; some must be outside, and it warns where that are few
+        (of the first scan).
 
         Raises InputError for a file that cannot be used, and PipelineError where the mask covers
         all that the middle detector sees.
@@ -92,7 +106,30 @@ class SourceMask(Parameters):
                 place=f"{label}, {observation.name}",
                 cure="choose a smaller one",
             )
+        masked, _ = self._shares(observation)
+        if masked > MUCH and observation.index == 0:
+            left = f"leaves {_percent(1 - masked)} of the samples to tell drifts from"
+            warnings.warn(f"{label}: the source mask {left}; {SMALLER}", stacklevel=1)
         return inside
+
+    def of_modes(self, observation: Observation, label: str) -> Inside:
+        """Samples of a scan that are inside. Raises InputError for a file that cannot be used, and
+        warns where no detector is outside at some instants (of the first scan).
+        """
+        masked, covered = self._shares(observation)
+        if covered and observation.index == 0:
+            text = f"{label}: the source mask leaves {_percent(1 - masked)} of the samples, and"
+            text += f" nothing is removed at {_percent(covered)} of the instants, where it covers"
+            warnings.warn(f"{text} all detectors; {SMALLER}", stacklevel=1)
+        return self.of(observation)
+
+    def _shares(self, observation: Observation) -> tuple[float, float]:
+        """Shares of the samples inside, and of the instants with all detectors inside; from
+        `ENOUGH` instants.
+        """
+        thin = observation.thinned(slice(None, None, -(-observation.n_samples // ENOUGH)))
+        masked, covered = counts(self.of(thin), thin.n_detectors, thin.n_samples)
+        return masked / (thin.n_detectors * thin.n_samples), covered / thin.n_samples
 
     def of(self, observation: Observation) -> Inside:
         """Samples of a scan that are inside. Raises InputError for a file that cannot be used."""

@@ -76,6 +76,7 @@ class BinMap(MapParameters):
         data.layouts[self.label] = {"product": self.product, "kind": self.kind}
         if not data.observations:
             return []
+        MapLayout(self).warn_of_pixels(data.observations)
         if self.stokes == "IQU":
             check_polarized(data.observations[0], self.label)
             warn_before(data.observations, self.frame, self.condition_limit, self.label)

@@ -9,6 +9,7 @@ another tangent plane holds the whole field.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,6 +18,7 @@ import numpy as np
 
 from zonda.core.data import Observation, percent
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.numerics.angles import ARCSEC
 from zonda.core.numerics.sphere import local_axes, unit_vectors
 from zonda.core.types import Floats
 
@@ -104,6 +106,16 @@ class MapLayout:
 
     parameters: MapParameters
 
+    def warn_of_pixels(self, observations: Sequence[Observation]) -> None:
+        """Warn of pixels that are larger than the beam."""
+        asked, beam = self.parameters, observations[0].instrument.beam_fwhm
+        side = math.sqrt(math.pi / 3) / asked.nside if asked.nside else asked.pixel
+        if 0 < beam < side:
+            pixel, fwhm, third = (f"{a / ARCSEC:.3g} arcsec" for a in (side, beam, beam / 3))
+            cure = "raise nside" if asked.nside else f"choose pixel: {third} or less"
+            text = f"{asked.label}: a pixel of {pixel} for a beam of {fwhm}"
+            warnings.warn(f"{text}: sources are averaged away; {cure}", stacklevel=1)
+
     def common(
         self,
         observations: Sequence[Observation],
@@ -118,6 +130,7 @@ class MapLayout:
         asked = self.parameters
         if not observations:
             return before
+        self.warn_of_pixels(observations)
         first = observations[0]
         instrument = first.instrument
         if before is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import numpy as np
@@ -48,6 +49,33 @@ def test_it_is_a_disc_on_the_sky(bench):
     assert counts(inside, N_DET, N) == (int(found.sum()), int(found.all(axis=0).sum()))
     elsewhere = SourceMask(radius="25 arcsec", centre="05h +21d").of(observation)
     assert not elsewhere.at(slice(0, N_DET), slice(0, N)).any()
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        (HighpassFilter(frequency="0.5 Hz", mask=MASK), "samples to tell drifts from"),
+        (CommonModeFilter(mask=MASK), "nothing is removed at about"),
+    ],
+)
+def test_a_mask_that_leaves_little_warns(bench, step, words):
+    """The share that is left is stated, to a twentieth; a small mask says nothing."""
+    observation, modes = bench.observation(N_DET, N), isinstance(step, CommonModeFilter)
+    observation.focalplane.xi, observation.focalplane.eta = (
+        (x if modes else x / 10) for x in (observation.focalplane.xi, observation.focalplane.eta)
+    )  # a field smaller than the scan: each detector leaves the mask
+    away = distance(bench, observation)
+    # half of the samples, or all detectors at a tenth of the instants
+    radius = float(np.quantile(away.max(axis=0), 0.1) if modes else np.quantile(away, 0.5))
+    wide = step.model_copy(update={"mask": SourceMask(radius=f"{radius} rad")})
+    with pytest.warns(UserWarning, match=words) as found:
+        wide._inside(observation)
+    left = int(re.search(r"leaves about (\d+) %", str(found[0].message))[1])
+    assert left == pytest.approx(100 * (away > radius).mean(), abs=4)  # 2.5 and 256 instants
+    small = step.model_copy(update={"mask": SourceMask(radius="2 arcsec")})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small._inside(observation)
 
 
 def source(bench, observation):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import astropy.units as u
 import healpy
@@ -21,6 +22,7 @@ from zonda.core.numerics.smooth import SmoothField
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.intensity_kernel import VALUE, WEIGHT
+from zonda.operators.maps.map_layout import MapLayout
 from zonda.operators.maps.map_sums import MapSums
 
 ARCSEC = np.radians(1 / 3600)
@@ -676,3 +678,19 @@ def test_pixels_far_from_the_centre_are_smaller_and_hold_less_of_a_beam():
     np.testing.assert_allclose(
         product.seconds_per_beam()[y.astype(int), x.astype(int)], beam / area / 10.0, rtol=1e-3
     )
+
+
+@pytest.mark.parametrize(
+    ("pixels", "words"),
+    [
+        ({"pixel": "2 arcmin"}, "120 arcsec for a beam of 8.5 arcsec(.|\n)*2.83"),
+        ({"nside": 1024}, "nside"),
+    ],
+)
+def test_a_pixel_larger_than_the_beam_warns(bench, pixels, words):
+    observation = bench.observation(3, 50)
+    with pytest.warns(UserWarning, match=words):
+        MapLayout(BinMap(**pixels)).common([observation], None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        MapLayout(BinMap(pixel="8 arcsec")).common([observation], None)
