@@ -310,6 +310,19 @@ def test_nets_of_the_cmb_are_turned_into_rayleigh_jeans():
     )  # of 4 digits, with NET_corr
 
 
+def test_nets_of_cmb_s4_are_those_of_its_model_with_their_correlation():
+    """s4sim/hardware/config.py (3a15318), LAT0: NET [uK_CMB s(1/2)] and NET_corr."""
+    for name, *levels in (
+        ("cmb_s4_lat_lf", 384 * 1.30, 230 * 1.14),
+        ("cmb_s4_lat_mf", 288 * 1.18, 313 * 1.01),
+        ("cmb_s4_lat_hf", 670 * 1.02, 1615 * 1.01),
+    ):
+        for band, level in zip(instruments.create(name).bands, levels, strict=True):
+            assert band.net / cmb_slope(band.centre) * 1e6 == pytest.approx(
+                level, rel=5e-4
+            )  # of 4 digits
+
+
 SENSITIVITIES = {
     "so_lat_lf": ((48, 24), (35, 18)),
     "so_lat_mf": ((5.4, 6.7), (3.9, 4.2)),
