@@ -131,7 +131,8 @@ class Data:
             one, other = own[what].name, getattr(self.scene, what).name
             text = f"{one}, the file's"
             if one != other:
-                text += f"; the scene's {other} is not used"
+                use = "is not used" if what == "site" else "gives what it does not state"
+                text += f"; the scene's {other} {use}"
             self.log.state(label, what, text)
         self.scene = self.scene.model_copy(
             update={what: own[what] for what in ("site", "instrument")}

@@ -154,7 +154,7 @@ def _table(place: str, columns: dict[str, Any]) -> tuple[Table, list[str]]:
         numbers = {key: values[sees] for key, values in numbers.items()}
         rows = np.flatnonzero(sees).tolist()
         if dark := len(names) - len(rows):
-            notes.append(f"{dark} detectors without a band (dark ones) are left out")
+            notes.append(f"dark detectors, without a band, are left out: {dark}")
             texts = {key: [values[row] for row in rows] for key, values in texts.items()}
     _check(place, texts["name"], numbers)
     begins = {band.partition("_")[:2] for band in texts.get("band", [])}

@@ -353,8 +353,9 @@ class _Check(Mistakes):
         for key in sorted(OWN & given.keys()):
             if getattr(scene, key).name != above[key].name:
                 text = f"{step.label}: {key} is that of the recorded data, {above[key].name}"
+                use = "is not used" if key == "site" else "gives what they do not state"
                 warnings.warn(
-                    f"{text}; {getattr(scene, key).name} of this file is not used", stacklevel=2
+                    f"{text}; {getattr(scene, key).name} of this file {use}", stacklevel=2
                 )
         return scene.model_copy(update=above)
 

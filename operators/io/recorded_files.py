@@ -33,7 +33,7 @@ from .recorded_scan import (
     rows_of_bands,
     site_of,
 )
-from .recorded_stream import RecordedStream, kelvin_per, scale_of
+from .recorded_stream import RecordedStream, check_unit, kelvin_per, scale_of
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 from .toast_noise import DEFAULT_MODEL
@@ -271,6 +271,8 @@ class RecordedFiles(Operator):
             have = ", ".join(sorted(streams)) or "none"
             cure = f"set signal to one of: {have}; or signal: none for the pointing alone"
             raise InputError(f"has no stream {self.signal!r}", place=place, cure=cure)
+        if self.signal is not None:
+            check_unit(self.unit or streams[self.signal], self.signal, place)
         rows = rows_of_bands(tod, self.band, place)
         used = (tod.detector_flags & np.uint8(self.detector_mask)) == 0
         use = np.concatenate([r[used[r]] for r in rows])

@@ -187,13 +187,20 @@ def scale_of(unit: str) -> tuple[str, bool]:
     return (name, scale == "CMB") if scale in ("CMB", "RJ") else (unit, False)
 
 
+def check_unit(unit: str, name: str, place: str) -> None:
+    """Raise InputError for a stream in a unit that is none of temperature."""
+    if kelvin_per(scale_of(unit)[0]) is None:
+        cure = "calibrate it to a temperature; state its unit, e.g. LoadTOD: {unit: K_CMB}"
+        has = f"is in {unit!r}, not in kelvin" if unit else "has no unit"
+        raise InputError(f"the stream {name} {has}", place=place, cure=cure)
+
+
 def _kelvin(unit: str, name: str, place: str, band: Band | None) -> float:
     """Kelvin (Rayleigh-Jeans) per unit of a stream."""
     plain, of_cmb = scale_of(unit)
-    found = kelvin_per(plain)
-    if found is None or (of_cmb and band is None):
-        cure = "calibrate it to a temperature, and state its unit, e.g. LoadTOD: {unit: K_CMB}"
-        raise InputError(
-            f"the stream {name} is in {unit or 'no unit'!r}, not in kelvin", place=place, cure=cure
-        )
+    check_unit(unit, name, place)
+    if of_cmb and band is None:
+        cure = "convert it with LoadTOD, which knows the band, and SaveTOD"
+        raise InputError(f"the stream {name} is in {unit}", place=place, cure=cure)
+    found = kelvin_per(plain) or 1.0
     return found * to_kelvin_rj("K_CMB", band) if of_cmb and band is not None else found

@@ -106,7 +106,7 @@ def test_leakage_dark_detectors_and_a_file_without_bands(tmp_path: Path) -> None
     dark = toast_file(tmp_path / "b.h5", bandcenter=np.array([92, 92, np.nan, np.nan]) * u.GHz)
     table = read_array(dark)
     assert table.names == ["a", "b"]
-    assert "2 detectors without a band (dark ones) are left out" in table.notes
+    assert "dark detectors, without a band, are left out: 2" in table.notes
     none = read_array(toast_file(tmp_path / "c.h5", bandcenter=None, bandwidth=None))
     assert "net" not in none.columns
     assert "without a band they cannot be turned into K_RJ" in " ".join(none.notes)
@@ -146,7 +146,7 @@ def test_hardware_of_sotodlib(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(plane.net, [1.1 * net(0)] * 2 + [1.1 * net(1)] * 2, rtol=1e-9)
     np.testing.assert_allclose([plane.knee, plane.slope], [[0.05] * 4, [3.0] * 4])
     assert camera.notes["focal plane"] == (
-        "1 detectors without a band (dark ones) are left out; bands are called without SAT_; NETs,"
+        "dark detectors, without a band, are left out: 1; bands are called without SAT_; NETs,"
         " times NET_corr, are turned from K_CMB into K_RJ over the band of each detector; slopes"
         " above 3 are taken as 3"
     )

@@ -264,11 +264,11 @@ def test_other_bytes(kind: str, tmp_path: Path) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_other_values(kind: str, tmp_path: Path) -> None:
-    assert tried(kind, tmp_path, range(1000, 2000)) > 100
+    assert tried(kind, tmp_path, range(1000, 1300)) > 50
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("kind", KINDS)
 def test_many_other_bytes(kind: str, tmp_path: Path) -> None:
     """HDF5's too: what is left of a file that libhdf5 opens."""
-    tried(kind, tmp_path, range(1000, 1300), flip)
+    tried(kind, tmp_path, range(1000, 1060), flip)

@@ -105,7 +105,7 @@ def test_az_el_and_roll_are_the_boresight(tmp_path: Path) -> None:
 def test_units(tmp_path: Path) -> None:
     """Of a Quantity, of the parameter, of the CMB in each band; none is refused."""
     bare = saved(tmp_path / "a.h5")
-    with pytest.raises(InputError, match=r"no unit(.|\n)*LoadTOD: {unit: K_CMB}"):
+    with pytest.raises(InputError, match=r"has no unit(.|\n)*LoadTOD: {unit: K_CMB}"):
         run(bare)
     with pytest.raises(ParameterError, match="give a unit of temperature"):
         run(bare, unit="pW")

@@ -204,7 +204,7 @@ def test_another_instrument_in_the_scene_is_not_used(night: Any) -> None:
     assert (
         "LoadTOD",
         "instrument",
-        "camera, the file's; the scene's mustang2 is not used",
+        "camera, the file's; the scene's mustang2 gives what it does not state",
     ) in list(found.log)
 
 

@@ -658,7 +658,7 @@ def test_a_pipeline_file_needs_neither_site_nor_instrument(saved: Any, tmp_path:
     assert "mustang2" in (tmp_path / "report.html").read_text()
     with pytest.warns(
         UserWarning,
-        match="instrument is that of the recorded data, .*; atlast of this file is not used",
+        match="instrument is that of the recorded data, .*; atlast of this file gives what",
     ):
         other = parse("instrument: atlast\nsite: green_bank\n" + text)
     assert other.scene().instrument.telescope.diameter == 100
