@@ -425,10 +425,9 @@ def test_each_pixel_has_the_spectrum_of_its_own_temperature(made, save, projecti
             got = made.look(SkyMap(file=y, te=gas), scan)
             np.testing.assert_allclose(got, want, rtol=1e-5)
             stated = next(text for _, what, text in scan.log if what == "electron temperature")
-            step = SkyMap(file=y, te=gas)
-            state, data = step.prepare(scan), Data()
-            step.collect(data, scan, state)
-            assert data.partial[step.label].image.header["GASTEMP"] == stated
+            state = SkyMap(file=y, te=gas).prepare(scan)
+            kept = InputImage(state.sky.image("SkyMap", state.grid)).arrays()
+            assert InputImage.of(kept).image.header["GASTEMP"] == stated
             assert f"(cold gas {cold / 2e-4:.5g})" in stated
         assert stated.startswith(f"{value:g} keV: {want / 2e-4:.5g} K_RJ per y")
 
