@@ -70,8 +70,8 @@ def test_white_noise_is_what_the_map_and_the_report_state(kind, dec):
     )
     assert rms == pytest.approx(wanted, rel=0.09)  # three of these errors
     assert one.smoothed_rms(FWHM, radius) == pytest.approx(smooth.rms(radius), rel=1e-4)
-    ((shown, what),) = expected("map", one, 2 * radius)
-    value, unit = shown.split("\u00a0")
+    ((what, beam, _),) = expected("map", one, 2 * radius)
+    value, unit = beam.partition(" (")[0].partition(",")[0].split("\u00a0")
     assert float(value) * {"mK_RJ": 1e-3, "K_RJ": 1}[unit] == pytest.approx(wanted, rel=0.01)
     assert "white noise by NET and samples" in what
 
