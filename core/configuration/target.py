@@ -284,9 +284,12 @@ def _sexagesimal(match: re.Match[str], name: str, *, hours: bool) -> float:
     minutes, seconds = float(match["minutes"]), float(match["seconds"] or 0)
     if minutes >= 60 or seconds >= 60:
         raise mistake(f"minutes and seconds of {given} must be below 60")
-    if (match["mark"].lower() == "h" or (colons and hours)) and int(match["whole"]) >= 24:
+    whole = float(match["whole"])
+    if (match["mark"].lower() == "h" or (colons and hours)) and whole >= 24:
         raise mistake(f"the hours of {given} must be below 24")
-    magnitude = int(match["whole"]) + (minutes + seconds / 60) / 60
+    if not whole < 1e6:
+        raise mistake(f"the degrees of {given:.60} must be below 1e6")
+    magnitude = whole + (minutes + seconds / 60) / 60
     unit = 15.0 if match["mark"].lower() == "h" or (colons and hours) else 1.0
     return (-magnitude if match["sign"] == "-" else magnitude) * unit
 

@@ -85,8 +85,8 @@ _LARGE_POWER = re.compile(r"\d{3}")
 """Powers of three digits are refused: astropy would compute 10**9999999."""
 
 
-_DECIMAL_POWER = re.compile(r"\^(-?\d*\.\d+)")
-"""s^0.5, which astropy reads as s**(0.5)."""
+_DECIMAL_POWER = re.compile(r"(?:\^|\*\*)(-?\d*\.\d+)")
+"""s^0.5 and s**0.5, which astropy reads as s**(0.5)."""
 
 
 @lru_cache(maxsize=512)

@@ -103,10 +103,15 @@ class RecordedTable:
     @classmethod
     def of(cls, columns: Mapping[str, tuple[NDArray[Any], str]], place: str) -> RecordedTable:
         """Build the table from arrays with units: those with one number per row become columns."""
-        plain = {
+        plain: dict[str, tuple[Any, str]] = {
             name: (values, unit)
             for name, (values, unit) in columns.items()
             if values.ndim == 1 and values.dtype.kind in "fiub"
+        }
+        plain |= {  # times may be dates
+            name: ([str(text) for text in values.tolist()], unit)
+            for name, (values, unit) in columns.items()
+            if values.ndim == 1 and values.dtype.kind == "U"
         }
         lines = [0] * (1 + max((len(values) for values, _ in plain.values()), default=0))
         found = cls(Table(place, plain, lines))
@@ -212,8 +217,10 @@ def _fits(path: Path, place: str) -> RecordedTable:
             azel = any(names >= {a, b} for a in ALIASES["az"] for b in ALIASES["el"])
             if not azel and not names >= {"ra", "dec"}:
                 continue
-            given = {c.name.lower(): (np.asarray(hdu.data[c.name]), c.unit or "") for c in columns}
-            found = RecordedTable.of(given, place)
+            given = {
+                c.name.lower(): (np.asarray(hdu.data[c.name]), str(c.unit or "")) for c in columns
+            }
+            found = _dated(RecordedTable.of(given, place))
             found.in_seconds = True
             start = file[0].header.get("DATE-OBS")
             if "seconds" in names and start:

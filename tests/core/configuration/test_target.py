@@ -152,3 +152,8 @@ def test_forms_that_people_bring_along() -> None:
 def test_schema_examples_parse() -> None:
     field = Model.model_json_schema()["properties"]["target"]
     assert all(Target.parse(example) for example in field["examples"])
+
+
+def test_degrees_beyond_all_numbers():
+    with pytest.raises(ValueError, match="must be below 1e6"):
+        Target.parse(f"{'9' * 400}d00m00s +20d00m00s")
