@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 from pydantic import Field, PrivateAttr, model_validator
 
 from .errors import InputError, OutputError
-from .maps.units import Map, converted, parse_unit
+from .maps.units import KNOWN_UNITS, Map, converted, parse_unit
 from .numerics.radiation import SURFACE_BRIGHTNESS_UNITS
 from .operator import Operator
 from .signal import Signal
@@ -84,7 +84,7 @@ class MapOutput(Output):
         try:
             plain, _ = parse_unit(self.unit or "K_RJ", place="unit", temperature_scale="K_RJ")
         except InputError as error:
-            raise ValueError(error.message) from None
+            raise ValueError(f"{error.message}; use {KNOWN_UNITS}") from None
         if self.spectral_index and plain not in SURFACE_BRIGHTNESS_UNITS:
             raise ValueError(f"spectral_index is for {', '.join(SURFACE_BRIGHTNESS_UNITS)}")
         return self

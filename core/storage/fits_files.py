@@ -149,7 +149,7 @@ def check_size(hdu: Any, place: str, *, whole: bool = True) -> None:
 
 _END = re.compile(rb"END( {0,76}[^A-Z0-9_-]|$)")
 """The end of a header, as astropy recognizes it."""
-_NUMBER = re.compile(rb"(NAXIS\d{0,3}|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *(-?\d+)")
+_NUMBER = re.compile(rb"(NAXIS\d{0,3}|TFIELDS|BITPIX|PCOUNT|GCOUNT) *= *([-+]?) *(\d+)")
 
 
 def _next_header(file: IO[bytes], place: str) -> int | None:
@@ -159,7 +159,7 @@ def _next_header(file: IO[bytes], place: str) -> int | None:
         block = file.read(BLOCK)
         for line in (block[k : k + CARD] for k in range(0, len(block), CARD)):
             if match := _NUMBER.match(line):
-                key, value = match[1], int(match[2][:20])
+                key, value = match[1], int(match[2] + match[3][:20])  # astropy takes "- 21"
                 found.setdefault(key, value)
                 if key in (b"NAXIS", b"TFIELDS") and value > FIELDS_MAX:
                     raise _corrupt(

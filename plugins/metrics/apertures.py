@@ -54,7 +54,9 @@ class _InAperture(FigureMetric):
         needs_signal(kinds, self.own_name(), self.map)
 
     def flux(self, data: Data, signal: str) -> ApertureFlux:
-        """Of the map of a signal; its error from all but the sky, else the half-difference."""
+        """Find it in the map of a signal, with its error from all but the sky, else from the
+        half-difference.
+        """
         product = map_of(data, self.own_name(), signal, self.map)
         product = product if product.polarization is None else product.stokes("I")
         maps, name = maps_of(data.products), product_name(stream_of(signal), self.map)

@@ -72,6 +72,7 @@ def refused(path: Path, words: str) -> None:
         ("NAXIS1", "1000000000", "needs .* GB of memory|truncated"),
         ("NAXIS1", "999999999999999999999", "needs .* GB of memory|cannot be read"),
         ("NAXIS1", "-5", "cannot be read|cube|negative length"),
+        ("NAXIS1", "-   5", "cannot be read|cube|negative length"),
         ("NAXIS", "1000000000", "more than the 999 that FITS allows"),
         ("NAXIS", "999", "incomplete or corrupt: NAXIS3"),
         ("BITPIX", "7", "incomplete or corrupt: 7"),
