@@ -39,8 +39,8 @@ FLAGS = {
 all (`_scans`).
 """
 CALIBRATION = {"phase_to_pW": 1.0, "polarity": 1, "r_tes": 0.004, "r_n": 0.008, "r_frac": 0.5}
-"""Of every detector: factors that leave the signal in K_RJ, and stand-ins for the resistances [ohm]
-of a detector that is biased well, which zonda does not simulate.
+"""Calibration of every detector: factors that leave the signal in K_RJ, and stand-ins for the
+resistances [ohm] of a detector that is biased well, which zonda does not simulate.
 """
 SCANS = {"left_scan": "rightleft", "right_scan": "leftright"}
 """Names of sotodlib: to the left is towards smaller azimuth; ends of the intervals' names."""
