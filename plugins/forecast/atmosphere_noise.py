@@ -45,6 +45,8 @@ WAVES = 320
 noise (AtLAST); 1280 change it by 8 %."""
 POINTS, DETECTORS = 8, 64
 """Number of probes, and of the detectors that A is averaged over."""
+TEMPLATE, GROUPS = 1e7, 9
+"""Samples of a scan of which a template is made, and groups of detectors across the focal plane."""
 MOST = 12
 """Number of scans that are followed, the first ones. The variance of later ones is taken to fall as
 1 / time.
@@ -307,33 +309,46 @@ def _of_waves(
     return np.array(rows)
 
 
-def _rows(survey: Survey, scans: list[_Scan], template: Template) -> list[tuple[Floats, AnyFloats]]:
-    """For each scan offsets of some detectors, and their series of a template, which stand for
-    all.
+def _rows(
+    survey: Survey, scans: list[_Scan], template: Template
+) -> list[tuple[Floats, Floats, AnyFloats]]:
+    """For each scan the series of a template, added up over groups of detectors that are near to
+    each other; the groups' offsets, and their shares of the detectors.
     """
     every = len(survey.offsets)
-    few = np.sort(np.random.default_rng(6).permutation(every)[:DETECTORS])
-    made = (template.rows(scan.track, few) for scan in scans)
-    weights = (
-        w * s.track.step * every / len(few) for w, s in zip(survey.weights, scans, strict=False)
-    )
-    return [(survey.offsets[few], w * rows) for w, rows in zip(weights, made, strict=True)]
+    most = max(len(scan.track.index) for scan in scans)
+    few = np.arange(every)
+    if (number := max(DETECTORS, round(TEMPLATE / most))) < every:
+        few = np.sort(np.random.default_rng(6).permutation(every)[:number])
+    offsets = survey.offsets[few]
+    cell = np.ptp(offsets, axis=0).max() / GROUPS + 1e-12
+    places = np.floor((offsets - offsets.min(axis=0)) / cell)
+    _, which = np.unique(places, axis=0, return_inverse=True)
+    adds = np.zeros((which.max() + 1, len(few)), np.float32)
+    adds[which.ravel(), np.arange(len(few))] = 1
+    size = adds.sum(axis=1)
+    found = []
+    for scan, weight in zip(scans, survey.weights, strict=False):
+        rows = adds @ template.rows(scan.track, few)
+        rows *= weight * scan.track.step * every / len(few)
+        found.append((adds @ offsets / size[:, None], size / len(few), rows))
+    return found
 
 
 def _of_template(
     survey: Survey,
     scans: list[_Scan],
-    rows: list[tuple[Floats, AnyFloats]],
+    rows: list[tuple[Floats, Floats, AnyFloats]],
     model: Layer,
     waves: Floats,
 ) -> Floats:
     """(n_scan, n_wave) the square in equation (1) of a template (`Template`), after each scan."""
     squares, n = [], len(waves)
-    for scan, (offsets, seen) in zip(scans, rows, strict=True):
+    for scan, (offsets, share, seen) in zip(scans, rows, strict=True):
         both, across = scan.waves(survey, model, waves)
         phases = np.exp(1j * (across @ offsets.T)).astype(np.complex64)
         if survey.common:
-            phases -= phases.mean(axis=1, keepdims=True)
+            phases -= (phases @ share)[:, None]
         value = ((phases @ seen) * (both[:n] + 1j * both[n:])).sum(axis=1)
         squares.append(abs(value) ** 2)
     return np.cumsum(squares, axis=0)

@@ -339,6 +339,8 @@ class SensitivityOfBands:
         return "".join(found._repr_html_() for found in self.bands.values())
 
 
+TEMPLATE = 0.1
+"""Relative error of the S/N of a template beyond that of the depth, by audits."""
 NAMES = {
     "white": ("white noise", "white"),
     "1/f": ("1/f noise", "pink"),
@@ -472,7 +474,8 @@ def _errors(found: Sensitivity) -> list[str]:
     ]
     if depth.known != PARTS:
         lines.append(
-            f"-: what is left of the atmosphere is not forecast, and comes on top: {depth.reason}"
+            "-: what is left of the atmosphere is not forecast, and comes on top (S/N are without"
+            f" it): {depth.reason}"
         )
     if "atmosphere" in there:
         lines.append(
@@ -498,7 +501,8 @@ def _reached(found: Sensitivity, wanted: str, unit: str) -> str:
         if not math.isfinite(seconds):
             lines.append(f"{wanted} of the {of} is not forecast")
             continue
-        low, high = ((1 + sign * depth.total_error(seconds)) ** 2 * seconds for sign in (-1, 1))
+        error = depth.total_error(seconds) + TEMPLATE * (of == "template")
+        low, high = ((1 + sign * error) ** 2 * seconds for sign in (-1, 1))
         before = [f"band {found.band}"] * bool(found.band) + [plane] * bool(found.polarization)
         what = f"{wanted} of the {of}" if sigma else wanted
         lines.append(

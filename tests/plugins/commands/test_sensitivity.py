@@ -139,7 +139,7 @@ def test_an_audit_beside_a_part_that_is_not_forecast(tmp_path, capsys):
         == 0
     )
     text = " ".join(capsys.readouterr().out.split())
-    assert "is not forecast, and comes on top: noise turns the singular mode" in text
+    assert "is not forecast, and comes on top (S/N are without it): noise turns" in text
     assert "audit: 2 simulations of the whole pipeline forecast [" in text
     assert (tmp_path / "depth" / "sensitivity.png").exists()
 

@@ -229,6 +229,16 @@ def test_json_and_table(tmp_path, capsys):
     assert {"snr_peak", "snr_template"} <= table.columns.keys()
 
 
+def test_the_atmosphere_in_a_template():
+    """For a point source both S/N are the same, also where the atmosphere is most of the noise."""
+    air = "AtmosphereLayers: {pwv: 8 mm, pwv_rms: 5 %}"
+    steps = DAISY, air, "WhiteNoise: {net: 0.5 mK s(1/2)}", "Efficiency", FILTERS[0]
+    found = seen(*steps, "CommonModeFilter: {method: mean}", source="point")
+    assert found.rms(part="atmosphere") > found.rms(part="white")
+    # waves scatter by some 10 %, and the circle of the depth is wider than the source
+    assert found.snr(of="template") == pytest.approx(found.snr(), rel=0.2)
+
+
 def test_names():
     assert Source.parse("Gaussian 1 arcmin").words == "Gaussian of FWHM 1′"
     assert Source.parse("beta 2 arcmin 0.8").words == "beta model of core radius 2′ and beta 0.8"
