@@ -153,7 +153,7 @@ def _scale(text: str, scale: str | None, place: str) -> str:
             place=place,
             cure=(
                 "set the header key TEMPSCAL to 'K_RJ' or 'K_CMB', or the parameter unit: K_RJ of"
-                " SkyMap"
+                " the step that reads it"
             ),
         )
     known = _SCALES.get(re.sub(r"^k_?(?=rj|cmb)|[\s_-]", "", scale.strip().lower()))
