@@ -64,7 +64,7 @@ SAMPLES, FEWEST = 4e6, 24
 PER_SOURCE, PER_BEAM, FINEST = 10.0, 3.0, 40.0
 """Pixels per size of a source, and per beam at least and at most."""
 OF = ("peak", "template")
-"""What of a source has a signal-to-noise ratio."""
+"""Parts of a source that have a signal-to-noise ratio."""
 _SIGMA = re.compile(r"\s*(\d+\.?\d*|\.\d+)\s*(sigma|σ)\s*", re.IGNORECASE)
 WIDE = 2.1
 """Half the image of a Gaussian in its FWHM: at its edge it is 5e-6."""
