@@ -4,6 +4,7 @@ processes that zonda starts.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import platform
 import sys
@@ -35,6 +36,12 @@ def resident_memory() -> int:
     with suppress(OSError, ValueError):
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return 0
+
+
+def give_back_memory() -> None:
+    """Give the system what the allocator keeps of freed arrays, where it can (glibc)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def one_blas_thread() -> None:

@@ -20,11 +20,11 @@ from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
 from .hooks import manager
-from .machine import available_memory, available_threads
+from .machine import available_memory, available_threads, give_back_memory
 from .observation import Observation
 from .operator import Operator, labels
 from .output import Output
-from .run.budget import least_memory
+from .run.budget import check_end, least_memory
 from .run.execution import execute
 from .run.settings import Settings, Timer
 from .run.views import Band, View
@@ -312,7 +312,7 @@ class Pipeline:
             longest = max(scans, key=lambda o: o.n_detectors * o.n_samples)
             note_signals([longest], self.signals.components, self.signals.formed)
             views.append(View(band.chain, longest))
-        return least_memory(views, Settings(dtype=self._dtype))
+        return least_memory(views, Settings(dtype=self._dtype), self.operators)
 
     @property
     def _dtype(self) -> type[np.floating[Any]]:
@@ -351,6 +351,8 @@ class Pipeline:
         """Run all observations with all bands."""
         for band in bands:
             self._make_ready(band)
+        give_back_memory()  # of pointing
+        check_end(bands, self.operators, settings)
         execute(bands, settings, timer)
 
     def _make_ready(self, band: Band) -> None:

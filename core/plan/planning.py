@@ -91,6 +91,8 @@ class Planning(Generic[O]):
         sample count.
     holds, per_detector, per_sample
         Bytes of its `memory`: for every observation, and for each detector and each sample of it.
+    per_pixel
+        Bytes that an output holds besides while it acts, for each pixel of the largest map.
     smaller
         Advice that lessens its `memory`, in a few words (``choose a larger pixel``), for a run that
         does not fit.
@@ -103,6 +105,7 @@ class Planning(Generic[O]):
     holds: ClassVar[int] = 0
     per_detector: ClassVar[int] = 0
     per_sample: ClassVar[int] = 0
+    per_pixel: ClassVar[int] = 0
     smaller: ClassVar[str] = ""
 
     def __init__(self, operator: O) -> None:
@@ -132,13 +135,30 @@ class Planning(Generic[O]):
 
     def memory(self, observation: Observation) -> int:
         """Bytes that the step will hold for one observation, besides streams and blocks: tables,
-        accumulators, products.
+        accumulators.
 
         An upper bound, asked after `Operator.observe` and before `Operator.prepare`: a run that
         would not fit is refused before it starts.
         """
         each = self.per_detector * observation.n_detectors + self.per_sample * observation.n_samples
         return self.holds + each
+
+    def per_thread(self, observation: Observation, spilled: int) -> int:
+        """Bytes that each thread holds besides; ``spilled``: bytes of a sample of a stream on disk,
+        0 where there is none.
+        """
+        return 0
+
+    def finished(self, observation: Observation) -> tuple[int, int]:
+        """Bytes while the product is finished, and of the product then; `memory` is what is held
+        of it before.
+        """
+        return (self.memory(observation),) * 2
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of the map that it makes."""
+        return 0
 
     def sweeps(self, observation: Observation) -> int:
         """Number of times that `Operator.measure` goes through its stream with `Stream.sweep`; 0:

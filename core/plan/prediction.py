@@ -19,7 +19,7 @@ from ..data import Data, Observation
 from ..mapmaker import joins, made_by, makes_products
 from ..operator import Operator
 from ..output import Output
-from ..run.budget import BASE
+from ..run.budget import BASE, at_end, held
 from ..run.schedule import Schedule, does_the_same, schedule
 from ..run.settings import Settings
 from ..run.views import View
@@ -47,29 +47,37 @@ def memory_of(contexts: Sequence[Context], settings: Settings) -> float:
     """Bytes that a run holds at once, at most. ``contexts``: of each band; ``settings``: as of a
     run, but the memory is that of the whole process.
     """
-    views, held, products, outputs = list[View](), list[int](), list[int](), list[int]()
+    views, sizes, products = list[View](), list[int](), list[int]()
+    threads, pointed = settings.threads, 0
     for context in contexts:
         longest = max(context.observations, key=lambda o: o.n_samples * o.n_detectors)
         assert context.chain is not None
         views.append(View(context.chain, longest))
-        every = [(o, planning_of(o).memory(longest)) for o in context.operators]
-        during = [(o, size) for o, size in every if not isinstance(o, Output)]
-        held.append(POINTED * context.times + sum(size for _, size in during))
-        products.append(sum(size for o, size in during if makes_products(o)))
-        outputs.append(sum(size for o, size in every if isinstance(o, Output)))
+        steps = [o for o in context.operators if not isinstance(o, Output)]
+        pointed += POINTED * context.times
+        sizes.append(sum(held(o, longest, threads) for o in steps))
+        products.append(sum(held(o, longest, threads) for o in steps if makes_products(o)))
+    outputs = {o.label: o for c in contexts for o in c.operators if isinstance(o, Output)}
+    base, end = BASE + pointed, sum(at_end(views, list(outputs.values())).values())
 
-    def without(taken: int) -> Settings:
-        return replace(settings, memory=max(int(settings.memory - BASE - taken), 1))
+    def blocks(some: Sequence[View], taken: int) -> Schedule:
+        room = max(int(settings.memory - base - taken), 1)
+        return schedule(some, replace(settings, memory=room))
 
-    alone = [schedule([view], without(own)) for view, own in zip(views, held, strict=True)]
-    joined, rest = any(map(joins, views[0].chain.steps)), without(sum(held))
+    alone = [blocks([view], own) for view, own in zip(views, sizes, strict=True)]
+    for k, (view, one) in enumerate(zip(views, alone, strict=True)):  # copies of what is on disk
+        sizes[k] += one.mapped + sum(
+            held(o, view.observation, threads, one.spilled) - held(o, view.observation, threads)
+            for o in view.chain.steps
+        )
+    joined, rest = any(map(joins, views[0].chain.steps)), blocks(views, sum(sizes))
     if len(views) > 1 and (
-        joined or (Schedule(views, rest).at_once > 1 and does_the_same(views, rest, alone))
+        joined or (rest.at_once > 1 and does_the_same(views, rest.settings, alone))
     ):
-        return BASE + max(sum(held) + schedule(views, rest).bytes, *outputs)
+        return base + max(sum(sizes) + rest.bytes, end)
     # band after band: the products of the other bands stay in memory
-    each = zip(held, alone, outputs, products, strict=True)
-    return BASE + sum(products) + max(max(h + one.bytes, out) - own for h, one, out, own in each)
+    each = zip(sizes, alone, products, strict=True)
+    return base + max(end, sum(products) + max(h + one.bytes - own for h, one, own in each))
 
 
 @dataclass(frozen=True)

@@ -11,23 +11,76 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..assembly.chain import Chain
 from ..errors import PipelineError
 from ..machine import available_memory, resident_memory
 from ..mapmaker import joins, makes_products
+from ..observation import Observation
+from ..operator import Operator
+from ..output import Output
 from ..plan.planning import planning_of
 from .prefetch import Ahead
 from .schedule import Schedule, does_the_same, schedule
 from .settings import Settings, megabytes
 from .views import Band, View
 
-BASE = 230_000_000
-"""Bytes of the interpreter, libraries and compiled code."""
+BASE = 240_000_000
+"""Bytes of the interpreter, libraries, compiled code, and what the allocator keeps."""
 
 
+LIBRARIES = "zonda and its libraries"
+PRODUCTS = "products"
+ON_DISK = "pages of streams on disk"
+BLOCKS = "blocks on 1 thread"
 KEPT = "kept streams"
 OTHERS = "maps of other bands"
 FEWER = "keep fewer streams, of fewer or shorter scans"
+
+
+def held(step: Operator, observation: Observation, threads: int, spilled: int = 0) -> int:
+    """Bytes that a step holds for a scan, besides streams and blocks."""
+    planning = planning_of(step)
+    return planning.memory(observation) + threads * planning.per_thread(observation, spilled)
+
+
+def at_end(views: Sequence[View], outputs: Sequence[Operator]) -> dict[str, int]:
+    """Bytes by what holds them when scans are done: products that are finished, band after band, or
+    finished ones with the outputs that act on them, whichever is more.
+    """
+    each, pixels = list[tuple[int, int, int]](), 0
+    for view in views:
+        makers = [planning_of(o) for o in view.chain.steps if makes_products(o)]
+        pixels = max([pixels, *(maker.pixels for maker in makers)])
+        sizes = [(m.memory(view.observation), *m.finished(view.observation)) for m in makers]
+        each.append((sum(s[0] for s in sizes), sum(s[1] for s in sizes), sum(s[2] for s in sizes)))
+    work, kept, before = 0, 0, sum(sums for sums, _, _ in each)
+    for sums, finishing, product in each:
+        work = max(work, kept + before - sums + finishing)
+        kept, before = kept + product, before - sums
+    observation, most = views[0].observation, max(outputs, key=_per_pixel, default=None)
+    parts = {o.label: planning_of(o).memory(observation) for o in outputs}
+    if most is not None:
+        parts[most.label] += _per_pixel(most) * pixels
+    acting = {PRODUCTS: kept} | parts
+    return acting if sum(acting.values()) > work else {PRODUCTS: work}
+
+
+def _per_pixel(step: Operator) -> int:
+    return planning_of(step).per_pixel
+
+
+def check_end(bands: Sequence[Band], operators: Sequence[Operator], settings: Settings) -> None:
+    """Refuse a run (PipelineError) whose products would not fit when they are finished and written;
+    ``operators``: all steps.
+    """
+    if settings.asked and settings.process is None:
+        return
+    views = [band.longest for band in bands]
+    outputs = [o for o in operators if isinstance(o, Output)]
+    every = [o for view in views for o in view.chain.steps] + outputs
+    budget = settings.process or resident_memory() + available_memory() // 2
+    parts = {LIBRARIES: BASE} | at_end(views, outputs)
+    if sum(parts.values()) > budget:
+        raise _refused(every, parts, budget, settings)
 
 
 def divide(
@@ -69,10 +122,10 @@ def _groups(
     kept = size * len(bands[0].chain.keep) * sum(o.n_detectors * o.n_samples for o in every)
     if len(bands) > 1 and any(map(joins, bands[0].chain.steps)):
         return [(bands, _shared(views, settings, ahead, kept))]
-    held = [memory_of([view], products=True) for view in views]
+    products = [memory_of([view], settings.threads, products=True) for view in views]
     alone = [
-        _shared([view], settings, ahead, kept, sum(held) - mine)
-        for view, mine in zip(views, held, strict=True)
+        _shared([view], settings, ahead, kept, sum(products) - mine)
+        for view, mine in zip(views, products, strict=True)
     ]
     if Schedule(views, settings).at_once > 1:
         with suppress(PipelineError):  # not all of them fit at once
@@ -131,29 +184,37 @@ def divided(views: Sequence[View], settings: Settings, kept: int = 0, others: in
         needs it, and what would make it fit.
     """
     budget = settings.process or resident_memory() + available_memory() // 2
-    parts = {"zonda and its libraries": max(resident_memory(), BASE) if settings.fresh else BASE}
-    parts |= {KEPT: kept, OTHERS: others}
+    base = {LIBRARIES: max(resident_memory(), BASE) if settings.fresh else BASE}
+    base |= {KEPT: kept, OTHERS: others}
+    for threads in range(settings.threads, 0, -1):
+        parts = base | _of_steps(views, threads)
+        left = replace(settings, threads=threads, memory=max(budget - sum(parts.values()), 1))
+        found = schedule(views, left)
+        if found.spilled:
+            parts = base | _of_steps(views, threads, found.spilled) | {ON_DISK: found.mapped}
+            left = replace(left, memory=max(budget - sum(parts.values()), 1))
+            found = schedule(views, left)
+        if sum(parts.values()) + found.least <= budget:
+            return replace(left, process=budget)
+    raise _refused(views[0].chain.steps, parts | {BLOCKS: found.least}, budget, left)
+
+
+def _of_steps(views: Sequence[View], threads: int, spilled: int = 0) -> dict[str, int]:
+    """What steps hold, by label, of all bands."""
+    parts: dict[str, int] = {}
     for view in views:
         for o in view.chain.steps:
-            parts[o.label] = parts.get(o.label, 0) + planning_of(o).memory(view.observation)
-    fixed = sum(parts.values())
-    left = replace(settings, memory=max(budget - fixed, 1))
-    found = schedule(views, left)
-    if fixed + found.least > budget and left.threads > 1:
-        threads = min(left.threads - 1, (budget - fixed) * left.threads // found.least)
-        left = replace(left, threads=max(1, threads))
-        found = schedule(views, left)
-    if fixed + found.least > budget:
-        _refuse(views[0].chain, parts, found.least, budget, left)
-    return replace(left, process=budget)
+            size = held(o, view.observation, threads, spilled)
+            parts[o.label] = parts.get(o.label, 0) + size
+    return parts
 
 
-def memory_of(views: Sequence[View], products: bool = False) -> int:
+def memory_of(views: Sequence[View], threads: int, products: bool = False) -> int:
     """Bytes that the steps hold for a scan with some bands, besides streams and blocks;
     ``products``: what they add up over all scans alone.
     """
     return sum(
-        planning_of(o).memory(view.observation)
+        held(o, view.observation, threads)
         for view in views
         for o in view.chain.steps
         if makes_products(o) or not products
@@ -164,47 +225,55 @@ def with_scan_ahead(views: Sequence[View], settings: Settings) -> Settings | Non
     """The settings without what a scan holds that is prepared while another is executed; None where
     there is no room for it.
     """
-    size = memory_of(views) - memory_of(views, products=True)
+    threads = settings.threads
+    size = memory_of(views, threads) - memory_of(views, threads, products=True)
     less = replace(settings, memory=settings.memory - size)
     same = less.memory > 0 and does_the_same(views, less, [schedule(views, settings)])
     return less if same else None
 
 
-def least_memory(views: Sequence[View], settings: Settings) -> int:
-    """Bytes with which a process runs a scan with these bands on one thread, libraries included."""
-    one, products = replace(settings, threads=1), memory_of(views, products=True)
+def least_memory(
+    views: Sequence[View],
+    settings: Settings,
+    operators: Sequence[Operator] = (),
+) -> int:
+    """Bytes with which a process runs a scan with these bands on one thread, libraries included;
+    ``operators``: all steps.
+    """
+    one, products = replace(settings, threads=1), memory_of(views, 1, products=True)
     joined = any(map(joins, views[0].chain.steps))
     need = max(
-        memory_of(group) + products - memory_of(group, products=True) + schedule(group, one).least
+        memory_of(group, 1)
+        + products
+        - memory_of(group, 1, products=True)
+        + schedule(group, one).least
         for group in ([views] if joined else [[view] for view in views])
     )
-    return megabytes(BASE + need) * 1_000_000
+    end = sum(at_end(views, [o for o in operators if isinstance(o, Output)]).values())
+    return megabytes(BASE + max(need, end)) * 1_000_000
 
 
-def _refuse(
-    chain: Chain,
+def _refused(
+    steps: Sequence[Operator],
     parts: Mapping[str, int],
-    blocks: int,
     budget: int,
     settings: Settings,
-) -> None:
-    threads = settings.threads
-    need, free = sum(parts.values()) + blocks, available_memory() + resident_memory()
-    rows = sorted(
-        [*parts.items(), (f"blocks on {threads} thread{'s' if threads > 1 else ''}", blocks)],
-        key=lambda row: -row[1],
-    )
+) -> PipelineError:
+    need, free = sum(parts.values()), available_memory() + resident_memory()
+    rows = sorted(parts.items(), key=lambda row: -row[1])
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
     cures = [f"use --memory {megabytes(need)}MB"] if need * 1.05 <= free else []
-    smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in chain.steps}
-    own = need - parts["zonda and its libraries"]  # the process may hold more of other work
+    smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in steps}
+    own = need - parts[LIBRARIES]  # the process may hold more of other work
     cures += [
-        f"{label}: {how}" for label, how in smaller.items() if how and parts[label] > 0.1 * own
+        f"{label}: {how}"
+        for label, how in smaller.items()
+        if how and parts.get(label, parts.get(PRODUCTS, 0)) > 0.1 * own
     ]
-    if blocks > 0.1 * need and parts["zonda and its libraries"] < budget:
+    if parts.get(BLOCKS, 0) > 0.1 * need and parts[LIBRARIES] < budget:
         cures.append("split the scan into shorter ones")
     beyond = f", more than this machine has ({_size(free)})" if need > free else ""
-    raise PipelineError(
+    return PipelineError(
         f"the run would hold {_size(need)}{beyond}: {largest}; its memory budget is"
         f" {_size(budget)}",
         place=settings.place,

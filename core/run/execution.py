@@ -38,7 +38,7 @@ from ..discovery import RAISED
 from ..errors import PipelineError
 from ..hooks import manager
 from ..log import Log
-from ..machine import resident_memory
+from ..machine import give_back_memory, resident_memory
 from ..mapmaker import filters, joins
 from ..numerics.smooth import SmoothField
 from ..observation import Observation
@@ -82,6 +82,9 @@ def execute(bands: Sequence[Band], settings: Settings, timer: Timer) -> None:
                 band.watch("scan")
     finally:
         ahead.close()
+        for _, own in groups:
+            own.spare.clear()
+        give_back_memory()
 
 
 ELSEWHERE = "samples flagged as those of another band are: nothing is measured there"
@@ -218,7 +221,9 @@ class Execution:
         if settings.process is None:
             return settings
         taken = resident_memory() - sum(array.nbytes for array in settings.spare)
-        room = max(settings.process - taken - memory_of(self.views, products=True), 1)
+        room = max(
+            settings.process - taken - memory_of(self.views, settings.threads, products=True), 1
+        )
         threads = settings.threads
         if room >= settings.memory:
             return settings

@@ -29,6 +29,11 @@ from .views import View
 SCRATCH_STREAMS = 2
 """Block-sized arrays assumed for operators' own scratch when the budget is divided."""
 
+MAPPED = 32_000_000
+"""Bytes of a spilled stream that are in memory at most: the system maps pages around those that are
+touched, which are given back block by block.
+"""
+
 AMPLE = 3.0
 """Times the streams of all signals: with so much memory unfiltered ones are held across the
 filters, not made again.
@@ -53,6 +58,10 @@ class Schedule:
         Bytes that streams and blocks take at once; the least budget that would do.
     elsewhere
         Streams that are kept nowhere or on disk, in words.
+    spilled
+        Bytes of a sample, if one is on disk; else 0.
+    mapped
+        Bytes of pages of streams on disk that are in memory, beside ``bytes``.
     at_once
         Bands whose blocks are worked on together: all, if their detectors look through the same
         pixels and their smallest blocks fit in memory; else 1.
@@ -65,6 +74,8 @@ class Schedule:
     bytes: int = 0
     least: int = 0
     elsewhere: tuple[str, ...] = ()
+    spilled: int = 0
+    mapped: int = 0
     at_once: int = 1
 
     def __post_init__(self) -> None:
@@ -134,6 +145,9 @@ class Schedule:
             if segment.how == "again":
                 source = Source(segment=segment, names=segment.wanted)
                 continue
+            if segment.how == "spilled":
+                self.spilled = np.dtype(self.settings.dtype).itemsize
+                self.mapped = max(self.mapped, min(size, MAPPED))
             size = 0 if segment.how == "spilled" else size
             segment.held = held + (size if later else 0)
             smallest = self._least_blocks(segment)

@@ -81,7 +81,7 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         ),
         Knob("layers", (5, 10, 20), "thin sheets for a continuous atmosphere", redraws=True),
     )
-    holds, per_detector, per_sample = 100_000_000, 700, 40
+    holds, per_detector, per_sample = 10_000_000, 700, 40
 
     def memory(self, observation: Observation) -> int:
         """Tables, tiles of the turbulence, weights of the nodes; where there are none, the series

@@ -20,7 +20,7 @@ class PlotsPlanning(Planning[Plots]):
     """matplotlib and the pictures."""
 
     of = Plots
-    holds = 150_000_000
+    holds, per_pixel = 90_000_000, 112
 
 
 class ReportPlanning(Planning[Report]):

@@ -208,8 +208,14 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         n_det, n_samp = observation.n_detectors, observation.n_samples
         if self.operator.method == "mean":
             return 8 * 8 * n_samp + 100 * n_det
-        copy = min(8 * n_det * min(TILE_SAMPLES, n_samp), MOST_COPIED)
-        return 8 * (20 + 8 * self.operator.modes) * n_samp + 200 * n_det + copy
+        return 8 * (20 + 8 * self.operator.modes) * n_samp + 200 * n_det
+
+    def per_thread(self, observation: Observation, spilled: int) -> int:
+        """The copy of a tile of a stream on disk."""
+        if self.operator.method == "mean":
+            return 0
+        size = spilled * observation.n_detectors * min(TILE_SAMPLES, observation.n_samples)
+        return min(size, MOST_COPIED)
 
     def sweeps(self, observation: Observation) -> int:
         """One reading for the mean; the singular modes need the whole stream."""

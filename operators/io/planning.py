@@ -18,8 +18,8 @@ class SaveMapPlanning(Planning[SaveMap]):
     """It holds a map while it is written."""
 
     of = SaveMap
-    holds = 20_000_000
-    """A map and its copy in the file's units."""
+    holds, per_pixel = 5_000_000, 54
+    """Copies of planes in the file's units and byte order, `MOST_AT_ONCE` files."""
 
 
 class SaveTODPlanning(Planning[SaveTOD]):

@@ -292,6 +292,10 @@ def _extent(observation: Observation, samples: slice, matrix: Floats) -> Floats:
     return np.asarray((np.abs(offset) + grown).max(axis=1))
 
 
+LEAST_TOGETHER = 1 << 18
+"""Pixels of overlapping discs that are kept before they are united."""
+
+
 def covered_healpix(
     observations: Sequence[Observation],
     nside: int,
@@ -304,7 +308,7 @@ def covered_healpix(
     import healpy
 
     size = float(healpy.nside2resol(nside))
-    pieces = []
+    found, pieces = np.zeros(0, np.int64), list[NDArray[np.int64]]()
     for observation in observations:
         radius = math.atan(observation.focalplane.radius)
         spacing = max(radius, size) / 4
@@ -317,13 +321,12 @@ def covered_healpix(
             fine *= 2
         cells, first = np.unique(healpy.vec2pix(fine, *boresight.T), return_index=True)
         del cells
-        margin = radius + float(healpy.max_pixrad(fine)) * 2
-        pieces += [
-            healpy.query_disc(nside, boresight[k], min(margin, math.pi), inclusive=True, nest=nest)
-            for k in first
-        ]
-        pieces = [_union(pieces)]
-    return np.asarray(pieces[0], np.int64)
+        margin = min(radius + float(healpy.max_pixrad(fine)) * 2, math.pi)
+        for k in first:
+            pieces.append(healpy.query_disc(nside, boresight[k], margin, inclusive=True, nest=nest))
+            if sum(piece.size for piece in pieces) > max(found.size, LEAST_TOGETHER):
+                found, pieces = _union([found, *pieces]), []  # discs overlap
+    return _union([found, *pieces])
 
 
 def _union(pieces: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:

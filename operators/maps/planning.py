@@ -16,6 +16,9 @@ from .coverage import COUNTS
 from .grid import in_frame
 from .maximum_likelihood import MaximumLikelihoodMap
 
+HEALPY = 32_000_000
+"""Bytes of the library."""
+
 
 class BinMapPlanning(Planning[BinMap]):
     """The memory grows with the pixels."""
@@ -39,18 +42,44 @@ class BinMapPlanning(Planning[BinMap]):
         )
 
     def memory(self, observation: Observation) -> int:
-        """Sums of two threads, two halves, the products of all signals; and the pointing, twice
-        while it is laid out.
-        """
+        """Sums of two halves, what is found of the pointing, and healpy."""
         step, signals = self.operator, len(observation.signals)
-        each, samples = 56 + 72 * signals, 150
+        each, samples = 16 * (3 + signals), 150
         if step.stokes == "IQU":
-            # hits, six sums and three for each signal, in two threads and two halves
-            each, samples = 32 * (7 + 3 * signals) + 240 * signals, 250
+            each, samples = 16 * (7 + 3 * signals), 250
         each += sum(count.memory for name, count in COUNTS.items() if getattr(step, name))
         each += 40 if step.scan_hits else 0
         samples += 144 if step.crosslinking else 0
-        return each * step.grid.n_pixels + samples * observation.n_samples
+        more = HEALPY + 24 * step.grid.n_pixels if step.nside else 0
+        return each * step.grid.n_pixels + samples * observation.n_samples + more
+
+    def per_thread(self, observation: Observation, spilled: int) -> int:
+        """Sums of a thread: hits, weights and data; weights and noise of their own where detectors
+        differ.
+        """
+        signals, net = len(observation.signals), observation.focalplane.net
+        own = self.operator.noise == "scatter" or observation.window is not None
+        if self.operator.stokes == "IQU":
+            columns = 7 + 3 * signals + 6 * own
+        else:
+            columns = 1 + signals + 2 * (own or not np.all(net == net[:1]))
+        return 8 * columns * self.pixels
+
+    def finished(self, observation: Observation) -> tuple[int, int]:
+        """Sums beside the planes of all signals, the difference of others among them; planes of
+        HEALPix maps are copied into tables.
+        """
+        step, signals = self.operator, len(observation.signals)
+        each = 165 if step.stokes == "IQU" else 40
+        each += sum(count.memory for name, count in COUNTS.items() if getattr(step, name))
+        planes = each * (signals + (signals > 1)) * self.pixels
+        table = 75 * self.pixels if step.nside else 0
+        return self.memory(observation) + planes + table, planes + table
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of the map."""
+        return self.operator.grid.n_pixels
 
 
 class MaximumLikelihoodPlanning(BinMapPlanning):

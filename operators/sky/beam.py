@@ -117,20 +117,9 @@ def convolve(
     ``linear``: for linear interpolation, whose mean response sinc^2(k h) along each axis is divided
     out (`sampling`).
     """
-    covariance = (SIGMA * fwhm) ** 2 * np.linalg.inv(jacobian.T @ jacobian)  # pixel^2
-    width = np.sqrt(np.diag(covariance))  # sigma in pixels along (x, y)
-    across = fwhm / np.linalg.norm(jacobian, axis=0)  # pixels per FWHM along (x, y)
-    qx, qy = (
-        int(np.ceil(pixels_per_fwhm / a - 1e-9)) if SMOOTH_BELOW <= a < pixels_per_fwhm else 1
-        for a in across
-    )
-    _check_size(values.shape, width, across, (qx, qy))
-    pad_x, pad_y = (
-        int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy))
-    )
+    covariance, _, across = _in_pixels(jacobian, fwhm)
+    (qx, qy), (pad_x, pad_y), (ny, nx) = margins(values.shape, jacobian, fwhm, pixels_per_fwhm)
     rows, columns = values.shape
-    sides = rows * qy + 2 * pad_y, columns * qx + 2 * pad_x
-    ny, nx = (next_fast_len(n, True) for n in sides)
     grid = np.zeros((ny, nx))
     grid[pad_y : pad_y + rows * qy : qy, pad_x : pad_x + columns * qx : qx] = (values - outside) * (
         qx * qy
@@ -152,6 +141,35 @@ def convolve(
     )
     coarse = bool((across < SMOOTH_BELOW).any())
     return Convolved.of(grid, to_grid, np.array([*x, *y]), (qx, qy), coarse)
+
+
+def _in_pixels(jacobian: Floats, fwhm: float) -> tuple[Floats, Floats, Floats]:
+    """Covariance of the beam [pixel^2], and sigma [pixels] and pixels per FWHM along (x, y)."""
+    covariance = (SIGMA * fwhm) ** 2 * np.linalg.inv(jacobian.T @ jacobian)
+    return covariance, np.sqrt(np.diag(covariance)), fwhm / np.linalg.norm(jacobian, axis=0)
+
+
+def margins(
+    shape: tuple[int, ...],
+    jacobian: Floats,
+    fwhm: float,
+    pixels_per_fwhm: float,
+) -> tuple[tuple[int, int], tuple[int, int], tuple[int, int]]:
+    """Steps per pixel and margins along (x, y), and the shape (ny, nx), of the grid on which
+    `convolve` works. Raises InputError for one that does not fit in the memory.
+    """
+    _, width, across = _in_pixels(jacobian, fwhm)
+    qx, qy = (
+        int(np.ceil(pixels_per_fwhm / a - 1e-9)) if SMOOTH_BELOW <= a < pixels_per_fwhm else 1
+        for a in across
+    )
+    _check_size(shape, width, across, (qx, qy))
+    pad_x, pad_y = (
+        int(np.ceil(REACH * width[k] * q)) + SPLINE_MARGIN + q for k, q in ((0, qx), (1, qy))
+    )
+    sides = shape[0] * qy + 2 * pad_y, shape[1] * qx + 2 * pad_x
+    ny, nx = (next_fast_len(n, True) for n in sides)
+    return (qx, qy), (pad_x, pad_y), (ny, nx)
 
 
 def _at_knots(frequency: Floats) -> Floats:

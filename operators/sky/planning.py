@@ -31,6 +31,7 @@ from zonda.core.plan.bounds import (
 )
 from zonda.core.plan.planning import Knob, Planning
 
+from .beam import margins
 from .convolved import conversion
 from .gridding import Grid, extremes
 from .sky_input import GAS
@@ -71,15 +72,24 @@ class SkyPlanning(Planning[SkyMap]):
     )
 
     def memory(self, observation: Observation) -> int:
-        """The map, its Fourier transform while it is convolved, and the coefficients of each
-        beam.
+        """The map, the coefficients of each beam (float64 and float32), and the transforms of one
+        while it is convolved: grids of 8 bytes.
         """
         widths, _ = self.operator.beam_widths(observation)
         grid = self.operator.grid_of(observation)
-        angles = 0 if grid.source.polarization is None else 40 * observation.n_samples
-        each = 2 if grid.gridding is None or grid.is_flat else 3  # pixels are spread for each beam
-        source = grid.source.nbytes if grid.resampled else 0
-        return (5 + each * len(widths)) * grid.nbytes + source + angles
+        polarized = grid.source.polarization is not None
+        angles = 40 * observation.n_samples if polarized else 0
+        cells = [np.prod(self._convolved_shape(grid, float(fwhm))) for fwhm in widths]
+        spread = 1 if grid.gridding is None or grid.is_flat else len(widths)  # for each beam
+        coefficients = (36 if polarized else 12) * sum(cells) + 24 * max(cells)
+        return int(grid.source.nbytes + spread * grid.nbytes + coefficients) + angles
+
+    def _convolved_shape(self, grid: Grid, fwhm: float) -> tuple[int, int]:
+        """(ny, nx) on which the map is convolved."""
+        if grid.gridding is not None:
+            return grid.shape
+        jacobian = np.radians(np.asarray(grid.wcs.pixel_scale_matrix, np.float64))
+        return margins(grid.shape, jacobian, fwhm, self.operator.pixels_per_fwhm)[2]
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""

@@ -122,12 +122,12 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
     with pytest.raises(
         PipelineError,
         match=(
-            r"(?s)3\.23 GB: Heavy\.1 3 GB.*budget is 2 GB.*use --memory 33..MB.*Heavy.1: choose a l"
+            r"(?s)3\.24 GB: Heavy\.1 3 GB.*budget is 2 GB.*use --memory 3403MB.*Heavy.1: choose a l"
         ),
     ):
         divided(views(obs, chain), settings)
     libraries(monkeypatch, 10**9)
-    with pytest.raises(PipelineError, match=r"more than this machine has \(1\.23 GB\)") as refused:
+    with pytest.raises(PipelineError, match=r"more than this machine has \(1\.24 GB\)") as refused:
         divided(views(obs, chain), settings)
     assert "--memory" not in refused.value.cure
     found = divided(views(obs, chain), replace(settings, process=4 * 10**9))
@@ -136,14 +136,14 @@ def test_what_does_not_fit_is_refused_with_what_would_make_it_fit(monkeypatch):
 
 
 def test_blocks_that_are_too_large_are_worked_on_by_fewer_threads(monkeypatch):
-    """Blocks of 4 threads take 774 MB, of one 193.5 MB: 630 MB less the libraries' 230 MB have room
+    """Blocks of 4 threads take 774 MB, of one 193.5 MB: 640 MB less the libraries' 240 MB have room
     for two of them.
     """
     libraries(monkeypatch)
     chain = [Source(), Demean(), Sink()]
     assert (
         divided(
-            views(observation(16, 1_000_000), chain), Settings(threads=4, process=630 * 10**6)
+            views(observation(16, 1_000_000), chain), Settings(threads=4, process=640 * 10**6)
         ).threads
         == 2
     )
@@ -195,3 +195,25 @@ def test_memory_of_a_scan_that_is_prepared_ahead_is_counted():
     assert ahead is not None
     assert ahead.memory == 3_000_000_000
     assert with_scan_ahead(views(obs, chain), Settings(2, memory=1_000_000_000)) is None
+
+
+def test_products_that_do_not_fit_when_they_are_written_are_refused(monkeypatch, tmp_path):
+    """Pictures of a map take more than its sums: the run is refused before it begins."""
+    import zonda
+
+    libraries(monkeypatch)
+    steps = [
+        zonda.PointingStare(target={"az": "120 deg", "el": "60 deg"}, scan_duration="2 s"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.BinMap(pixel="1 arcsec", width="20 arcmin"),  # 1200^2 pixels
+        zonda.SaveMap(),
+    ]
+    scene = zonda.Scene(
+        site="green_bank", instrument="mustang2", time="2024-11-25T01:00", target="05h +20d", seed=1
+    )
+    budget = BASE + 1200**2 * (64 + 40) + 30_000_000  # sums of two halves, planes
+    pipeline = zonda.Pipeline([*steps, zonda.Plots()])
+    with pytest.raises(PipelineError, match=r"the run would hold .*Plots"):
+        pipeline.run(scene, output=tmp_path, threads=1, ceiling=budget)
+    zonda.Pipeline(steps).run(scene, output=tmp_path, threads=1, ceiling=budget)
