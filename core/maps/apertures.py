@@ -67,8 +67,12 @@ class ApertureFlux:
     noise: str
 
     def __str__(self) -> str:
-        error = f" +- {self.error:.2g}" if math.isfinite(self.error) else ""
-        return f"{self.flux:.5g}{error} Jy within {angle_text(self.radius)}"
+        if math.isfinite(self.error) and self.error > 0:  # two digits of the error, and as far
+            digits = max(1 - math.floor(math.log10(self.error)), 0)
+            flux = f"{self.flux:.{digits}f} +- {self.error:.{digits}f}"
+        else:
+            flux = f"{self.flux:.5g}"
+        return f"{flux} Jy within {angle_text(self.radius)}"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ ROWS = 256
 """Of an image whose Q and U are turned at a time."""
 
 
-@dataclass
+@dataclass(repr=False)
 class Image:
     """A pixelized brightness with its world coordinates.
 
@@ -42,6 +42,10 @@ class Image:
     unit: str = "K_RJ"
     polarization: Floats | None = None
     axis: Floats | None = None
+
+    def __repr__(self) -> str:
+        rows, columns = self.values.shape
+        return f"<Image {columns} x {rows}, {self.unit}>"
 
     def stokes(self, which: str, pole: Floats | None = None) -> Image:
         """I, Q or U as an image of its own, COSMO, from the meridians of its frame; NaN where I is.

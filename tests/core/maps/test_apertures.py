@@ -11,7 +11,7 @@ import pytest
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
-from zonda.core.maps.apertures import Aperture, within
+from zonda.core.maps.apertures import Aperture, ApertureFlux, within
 from zonda.core.maps.map_product import MapProduct
 from zonda.plugins.checks.scenes import camera
 
@@ -153,3 +153,15 @@ def test_weights_of_an_annulus_sum_to_nothing():
         product.grid, CENTRE, known
     )
     assert abs(weights.sum()) < 1e-12 * np.abs(weights).sum()
+
+
+def test_a_flux_has_the_digits_of_its_error():
+    texts = [
+        str(ApertureFlux(flux, error, np.radians(10 / 3600), 0.0, "white"))
+        for flux, error in ((0.0076992, 0.00074), (12.3456, 1.5), (0.01, np.nan))
+    ]
+    assert [text.partition(" Jy")[0] for text in texts] == [
+        "0.00770 +- 0.00074",
+        "12.3 +- 1.5",
+        "0.01",
+    ]
