@@ -159,11 +159,10 @@ def _report(err: ZondaError) -> None:
     colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
     _clear()
     if render := getattr(err, "render", None):
-        click.echo(render(colour), err=True)
+        text = render(colour)
     else:
-        click.echo(
-            f"{click.style('error', fg='red', bold=True) if colour else 'error'}: {err}", err=True
-        )
+        text = f"{click.style('error', fg='red', bold=True) if colour else 'error'}: {err}"
+    click.echo(text.encode(errors="backslashreplace").decode(), err=True)  # names that are no UTF-8
 
 
 def _clear() -> None:

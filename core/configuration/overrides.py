@@ -25,6 +25,9 @@ def apply(document: Document, text: str, keys: list[str]) -> list[Diagnostic]:
     if not equals or not key.strip():
         cure = "write Key.parameter=value, e.g. --set Step.frequency='0.5 Hz' or --set seed=8"
         return [Diagnostic("a setting needs a key, '=' and a value", place, "", cure)]
+    if any("\ud800" <= c <= "\udfff" for c in text):  # bytes of the command line
+        cure = "write it in UTF-8; rename a file whose name is in another encoding"
+        return [Diagnostic("a setting that is not UTF-8", place, "", cure)]
     new = yaml_places.load(source, column=len(key) + 1, text=value)
     if new.faults:
         return [

@@ -483,3 +483,10 @@ def test_python_m_zonda_is_the_command() -> None:
     assert wrong.returncode == 2
     assert "nowhere.yaml" in wrong.stderr
     assert "Traceback" not in wrong.stderr
+
+
+@pytest.mark.parametrize("text", ["name=\udcff", "n\udcffe=1"])
+def test_a_setting_that_is_not_utf8_is_a_users_mistake(here, capsys, text):
+    """Bytes of the command line that are no UTF-8 come as surrogates."""
+    assert cli.main(["check", "p.yaml", "--set", text]) == 2
+    assert "a setting that is not UTF-8" in capsys.readouterr().err
