@@ -12,8 +12,9 @@ bins of frequency of the residual baselines' powers. The inverse of (2) is
 
     1 / D (1 - sum_k h_k q_k q_k^T),   h_k = E_k / (D + E_k), 1 for a free mode.            (3)
 
-Q_b = Z g^(-1/2) (3) g^(-1/2) Z; Z takes a polynomial of each detector's scan off. Any Q_b >= 0
-makes an unbiased map; that of the noise itself makes the one of least noise.
+Q_b = Z g^(-1/2) (3) g^(-1/2) Z; Z takes a polynomial of each detector's scan off, fitted to the
+baselines that have samples; powers are those per such baseline. Any Q_b >= 0 makes an unbiased map;
+that of the noise itself makes the one of least noise.
 """
 
 from __future__ import annotations
@@ -66,6 +67,9 @@ class BaselineNoise:
         limit.
     fast
         (n_det,) the same of each detector, in the upper half of the frequencies.
+    freedom
+        (n_bins,) degrees of freedom of ``least``; 0 at the lowest frequencies, of which ``lines``
+        take a part.
     edges
         (n_bins + 1,) first frequency of each bin, and the end.
     """
@@ -82,29 +86,31 @@ class BaselineNoise:
     shared: Floats
     least: Floats
     fast: Floats
+    freedom: Floats
 
     @property
     def free_modes(self) -> Floats:
         """(free, n_det) u / sigma, 1 / K: what makes streams of free modes."""
         return np.ascontiguousarray(self.modes[: self.free] / np.sqrt(self.white))
 
-    def weigh(self, y: Floats) -> Floats:
-        """Q_b y of baselines (n_det, n_base)."""
+    def weigh(self, y: Floats, counted: NDArray[np.int32]) -> Floats:
+        """Q_b y of baselines (n_det, n_base), of which so many samples are ``counted``."""
         g = np.sqrt(self.white / self.length)[:, None]
         z = y / g
-        take_lines(z, self.lines)
+        take_lines(z, self.lines, counted)
         found = fft.rfft(z, axis=1)
         bins = np.repeat(np.arange(len(self.own)), np.diff(self.edges))
         share = self.shared / (self.own[:, None] + self.shared)
         share[:, : self.free] = 1.0
         _weigh(found, 1 / self.own[bins], np.ascontiguousarray(share[bins].T), self.modes)
         z = fft.irfft(found, y.shape[1], axis=1)
-        take_lines(z, self.lines)
+        take_lines(z, self.lines, counted)
         return np.asarray(z / g)
 
 
 def estimate(
     residual: Floats,
+    counted: NDArray[np.int32],
     white: Floats,
     length: int,
     rate: float,
@@ -118,6 +124,8 @@ def estimate(
 
     Parameters
     ----------
+    counted
+        (n_det, n_base) samples that each is the mean of.
     white
         (n_det,) variance of a sample, K^2.
     length, rate
@@ -130,13 +138,15 @@ def estimate(
         (free, n_det) the free modes, where they are known.
     """
     n_det, n_base = residual.shape
+    seen_of_each = np.count_nonzero(counted, axis=1)[:, None]
     lines = polynomials(n_base, trend)
     scaled = residual / np.sqrt(white / length)[:, None]
-    take_lines(scaled, lines)
-    powers = fft.rfft(scaled, axis=1) / np.sqrt(n_base)
+    take_lines(scaled, lines, counted)
+    powers = fft.rfft(scaled, axis=1) / np.sqrt(np.maximum(seen_of_each, 1))
     top = min(max(int(SLOW * length / rate * n_base), FEWEST), powers.shape[1])
     slow = np.concatenate([powers[:, 1:top].real, powers[:, 1:top].imag], axis=1)
-    modes = min(modes, n_det - 1)
+    n_seen = int(np.count_nonzero(seen_of_each))
+    modes = max(min(modes, n_seen - 1), 0)
     known = np.zeros((0, n_det)) if fixed is None else fixed
     found = leading(slow, modes, known)
     seen = np.einsum("kd,dt->kt", found, slow)
@@ -149,12 +159,14 @@ def estimate(
     every += np.einsum("dt,dt->t", powers.imag, powers.imag)
     for k, (low, high) in enumerate(pairwise(edges.tolist())):
         at = slice(max(low, 1), max(high, 2))
-        rest = (every[at] - amplitude[:, at].sum(axis=0)).mean() / max(n_det - modes, 1)
+        rest = (every[at] - amplitude[:, at].sum(axis=0)).mean() / max(n_seen - modes, 1)
         least[k], own[k] = rest, max(rest, 1.0)
         shared[k] = np.maximum(amplitude[:, at].mean(axis=1) - own[k], 0.0)
     upper = powers[:, powers.shape[1] // 2 :]
     rest_of_each = upper - np.einsum("kd,kt->dt", found, _projected(upper, found))
-    fast = (np.abs(rest_of_each) ** 2).mean(axis=1)
+    left = np.maximum(1 - (found**2).sum(axis=0), 0.1)  # of its white noise, without the modes
+    fast = np.where(seen_of_each[:, 0], (np.abs(rest_of_each) ** 2).mean(axis=1) / left, 1.0)
+    share = max(seen_of_each.max(), 1) / n_base
     middle = (edges[:-1] + edges[1:] - 1) / 2 / n_base * rate / length
     return BaselineNoise(
         white,
@@ -169,6 +181,8 @@ def estimate(
         shared,
         least,
         fast,
+        np.where(edges[:-1] < (1 + LOWEST) / share, 0, 2 * np.diff(edges) * share)
+        * max(n_seen - modes, 1),
     )
 
 
@@ -225,15 +239,30 @@ def _orthonormal(vectors: Floats, known: Floats) -> Floats:
 
 
 @kernel
-def take_lines(rows, lines):  # type: ignore[no-untyped-def]
-    """Subtract from each row (n_det, n) its projection on orthonormal ``lines`` (k, n)."""
+def take_lines(rows, lines, counted):  # type: ignore[no-untyped-def]
+    """Subtract from each row (n_det, n) its projection on orthonormal ``lines`` (k, n); where
+    nothing is ``counted`` (n_det, n) rows become 0, and lines are those of the rest.
+    """
     for d in range(rows.shape[0]):
-        for k in range(lines.shape[0]):
+        own = lines
+        if (counted[d] == 0).any():
+            own = lines.copy()
+            for k in range(lines.shape[0]):
+                before = (own[k] * own[k]).sum()
+                for t in range(rows.shape[1]):
+                    if counted[d, t] == 0:
+                        own[k, t] = rows[d, t] = 0.0
+                for _ in range(2):
+                    for j in range(k):
+                        own[k] -= (own[k] * own[j]).sum() * own[j]
+                size = (own[k] * own[k]).sum()
+                own[k] *= 1 / np.sqrt(size) if size > 1e-12 * before else 0.0
+        for k in range(own.shape[0]):
             total = 0.0
             for t in range(rows.shape[1]):
-                total += rows[d, t] * lines[k, t]
+                total += rows[d, t] * own[k, t]
             for t in range(rows.shape[1]):
-                rows[d, t] -= total * lines[k, t]
+                rows[d, t] -= total * own[k, t]
 
 
 @kernel

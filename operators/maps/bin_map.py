@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
-from zonda.core.data import Block, Data, Observation
+from zonda.core.data import Block, Data, Observation, percent
 from zonda.core.errors import PipelineError
 from zonda.core.types import Floats
 
@@ -83,7 +83,8 @@ class BinMap(MapParameters):
         if self.nside is not None:
             return []
         outside = MapLayout(self).outside(data.observations)
-        return [] if self.width is None else [outside]
+        text = f"samples outside the map: about {percent(outside, 2)}"
+        return [] if self.width is None else [text]
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations."""

@@ -157,17 +157,18 @@ class RunsOfTiles:
     @property
     def scatter(self) -> Floats:
         """(n_det,) variance of the samples about the means of their baselines: of white noise, from
-        the median over baselines of which at least half of the samples count. A source that few
-        baselines see does not change it. The median of chi^2 with k degrees of freedom is
-        k (1 - 2 / (9 k))^3 (Wilson & Hilferty 1931).
+        the median over baselines of which at least half as many samples count as of any. A source
+        that few baselines see does not change it; NaN where no two samples do. The median of chi^2
+        with k degrees of freedom is k (1 - 2 / (9 k))^3 (Wilson & Hilferty 1931).
         """
         about = np.maximum(self.squares - self.sums**2 / np.maximum(self.counted, 1), 0.0)
         freedom = np.maximum(self.counted - 1, 1)
         median = freedom * (1 - 2 / (9 * freedom)) ** 3
-        enough = (2 * self.counted >= self.length) & (self.counted > 1)
+        most = self.counted.max(axis=1, keepdims=True)
+        enough = (2 * self.counted >= most) & (self.counted > 1)
         return np.array(
             [
-                np.median(row[some] / middle[some]) if some.any() else 0.0
+                np.median(row[some] / middle[some]) if some.any() else np.nan
                 for row, middle, some in zip(about, median, enough, strict=True)
             ]
         )

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from zonda.core.data import Observation, percent
+from zonda.core.data import Observation
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.numerics.angles import ARCSEC
 from zonda.core.numerics.sphere import local_axes, unit_vectors
@@ -251,11 +251,11 @@ class MapLayout:
         image = TangentGrid((longitude, latitude), asked.pixel, (ny, nx), asked.frame)
         return checked(image, asked.label)
 
-    def outside(self, observations: Sequence[Observation]) -> str:
-        """The share of the samples outside an image of a given width; some hundred instants of each
-        scan are looked at. InputError for an image that is too large.
+    def outside(self, observations: Sequence[Observation], grid: Grid | None = None) -> float:
+        """Share of the samples outside an image of a given width, of some hundred instants of each
+        scan. ``grid``: of the image, if it is known. InputError for an image that is too large.
         """
-        grid = self.grid(self.place(observations, {}))
+        grid = grid or self.grid(self.place(observations, {}))
         beyond = looked = 0
         for scan in observations if self.parameters.width is not None else ():
             plane, at = scan.focalplane, slice(None, None, -(-scan.n_samples // 256))
@@ -264,7 +264,7 @@ class MapLayout:
             index = np.empty((len(plane.xi[some]), h.shape[1]), np.int32)
             grid.pixels(h, 0, h.shape[1], plane.xi[some], plane.eta[some], index)
             beyond, looked = beyond + int(np.count_nonzero(index < 0)), looked + index.size
-        return f"samples outside the map: about {percent(beyond / max(looked, 1), 2)}"
+        return beyond / max(looked, 1)
 
 
 def checked(grid: Image, place: str) -> Image:

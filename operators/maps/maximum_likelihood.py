@@ -39,11 +39,17 @@ from .binning import Weights, binnings
 from .compressed_scan import CompressedScan, RunsOfTiles, Tile, add_baselines
 from .intensity_kernel import VALUE, WEIGHT
 from .map_from_sums import MapFromSums
+from .map_layout import MapLayout
 from .map_sums import MapSums
 from .normal_equations import NormalEquations, Solution, WeighedScan
 
-LEAST_POWER = 0.2
-"""Of baselines, in units of white noise: less is left where a filter has removed slow noise."""
+LEAST_POWER, FREEDOM = 0.2, 40
+"""Of slow baselines, in units of white noise: less is left where a filter has removed slow noise.
+It is found from so many degrees of freedom at least: white noise has less once in 1e8."""
+SHORTEST = 16
+"""Baselines of a scan."""
+MOST_OUTSIDE = 1e-3
+"""Share of the samples: what detectors share cannot be told where some of them see no pixel."""
 STEADY, WHITE_LEVELS = 0.75, 3
 """Where fast baselines have less than this share of the power that the scatter within them tells,
 modes that detectors share have a part in that scatter: what baselines tell is taken, and modes are
@@ -110,30 +116,64 @@ class MaximumLikelihoodMap(BinMap):
         every = [(o.n_detectors * o.n_samples, o.n_samples) for o in data.observations]
         self._samples = sum(n for n, _ in every), sum(n for _, n in every)
 
+    def check(self, data: Data) -> list[str]:
+        """See `BinMap.check`. Raises PipelineError for a width that leaves samples outside."""
+        found = super().check(data)
+        if self.width is not None and data.observations:
+            self._need_all(MapLayout(self).outside(data.observations), self.label)
+        return found
+
+    def _need_all(self, outside: float, place: str) -> None:
+        if outside > MOST_OUTSIDE:
+            raise PipelineError(
+                f"{100 * outside:.2g} % of the samples are outside the map, and noise that"
+                " detectors share cannot be told there",
+                place=place,
+                cure="leave width out, or make the map with BinMap",
+            )
+
     def prepare(self, observation: Observation) -> LikelihoodScan:  # type: ignore[override]
         """What is found out of one observation.
 
-        Raises PipelineError where a window has changed the samples.
+        Raises PipelineError where a window has changed the samples, for samples outside the map,
+        and for too few or too short baselines.
         """
+        length = max(round(self.baseline * observation.sample_rate), 1)
+        number, place = -(-observation.n_samples // length), f"{self.label}, {observation.name}"
+        if length < 2:
+            raise PipelineError(
+                f"a baseline of {self.baseline:g} s has one sample, at"
+                f" {observation.sample_rate:g} Hz",
+                place=place,
+                cure=f"set baseline: {4 / observation.sample_rate:.2g} s, or longer",
+            )
+        if number < SHORTEST + self.trend:
+            raise PipelineError(
+                f"the scan has {number} baselines of {self.baseline:g} s, too few to find its noise"
+                " from",
+                place=place,
+                cure=f"set a shorter baseline, of which a scan has {SHORTEST + self.trend} or more;"
+                " or make the map with BinMap",
+            )
         if observation.window is not None:
             raise PipelineError(
                 f"{' and '.join(observation.windows)} changed the weight of samples",
-                place=f"{self.label}, {observation.name}",
+                place=place,
                 cure="leave the window out: slow noise needs none here",
             )
+        self._need_all(MapLayout(self).outside([observation], self.grid), place)
         prepared = super().prepare(observation)
-        return LikelihoodScan(
-            prepared, max(round(self.baseline * observation.sample_rate), 1), observation
-        )
+        return LikelihoodScan(prepared, length, observation)
 
     def measure(self, stream: Stream, model: Any = None) -> LikelihoodScan:
         """Compress a scan and estimate its noise, in one reading."""
         scan: LikelihoodScan = stream.state
         scan.compress(stream, self.label)
-        observation, white = stream.observation, scan.found.scatter
+        observation, white = stream.observation, scan.white(self.label)
         for _ in range(WHITE_LEVELS):
             scan.noise = estimate(
                 scan.found.means,
+                scan.found.counted,
                 white,
                 scan.length,
                 observation.sample_rate,
@@ -144,9 +184,12 @@ class MaximumLikelihoodMap(BinMap):
             white = np.where(scan.noise.fast < STEADY, white * scan.noise.fast, white)
             if (white == scan.noise.white).all():
                 break
-        if (scan.noise.least[2:] < LEAST_POWER).any():
+        freedom = np.cumsum(scan.noise.freedom)
+        power = np.cumsum(scan.noise.least * scan.noise.freedom) / np.maximum(freedom, 1)
+        power = power[freedom >= FREEDOM]
+        if (power < LEAST_POWER).any():
             raise PipelineError(
-                f"slow noise has {scan.noise.least[2:].min():.2g} of the power of white noise: a"
+                f"slow noise has {power.min():.2g} of the power of white noise: a"
                 " filter has removed it, and the signal with it",
                 place=f"{self.label}, {observation.name}",
                 cure=f"put {type(self).__name__} before filters, or leave these out",
@@ -276,14 +319,35 @@ class LikelihoodScan:
         for _, _, (rows, *made) in stream.sweep(tiles):
             for tile in made:
                 self.found.add(rows, tile)
-        bad = self.found.scatter <= 0
-        if bad.any():
-            name = observation.focalplane.names[self.rows[np.flatnonzero(bad)[0]]]
+
+    def white(self, place: str) -> Floats:
+        """(n,) variance of white noise; the median of the others for detectors without samples.
+
+        Raises PipelineError where there is none. Warns of detectors that lack samples which others
+        have.
+        """
+        observation, white = self.observation, np.asarray(self.found.scatter)
+        place = f"{place}, {observation.name}"
+        if np.isnan(white).all():
+            raise PipelineError("no samples count", place=place, cure="look at the log")
+        if (white <= 0).any():
+            name = observation.focalplane.names[self.rows[np.flatnonzero(white <= 0)[0]]]
             raise PipelineError(
                 f"detector {name} has no noise",
-                place=f"{place}, {observation.name}",
+                place=place,
                 cure="add WhiteNoise, or make the map with BinMap",
             )
+        number = self.found.counted.sum(axis=1)
+        less = (number > 0) & (number < 0.99 * number.max())
+        if less.any():
+            warnings.warn(
+                f"{place}: {int(less.sum())} detectors lack up to"
+                f" {100 * (1 - number[less].min() / number.max()):.2g} % of the samples that others"
+                " have: what detectors share stays in the map there; fill these gaps, or flag these"
+                " detectors",
+                stacklevel=4,
+            )
+        return np.where(np.isnan(white), np.nanmedian(white), white)
 
     def give_weights(self, reference: float, spare: Any) -> None:
         """Weigh detectors by the white level that was found, in units of the inverse variance
@@ -447,6 +511,7 @@ class LikelihoodMaps(MapFromSums):
                 y = one.data[self.sums.first][0] - scan.seen(m, np.zeros((0, len(noise.white))))[0]
                 new = estimate(
                     y,
+                    scan.counted,
                     noise.white,
                     scan.length,
                     scan.rate,
@@ -517,12 +582,13 @@ class LikelihoodMaps(MapFromSums):
         log, label, step = self.data.log, self.parameters.label, self.parameters
         log.state(label, "iterations", str(len(solution.history)))
         if solution.history:
-            log.state(label, "residual over right side", f"{solution.history[-1]:.1e}")
+            least = min(solution.history)
+            log.state(label, "residual over right side", f"{least:.1e}")
             log.state(label, "smallest Ritz value", f"{solution.ritz[0]:.1e}")
-            if solution.history[-1] >= step.tolerance:
+            if least >= step.tolerance:
                 warnings.warn(
-                    f"{label}: after {MOST_ITERATIONS} iterations the residual is"
-                    f" {solution.history[-1]:.1e} of the right side, not {step.tolerance:g}",
+                    f"{label}: after {len(solution.history)} iterations the residual is"
+                    f" {least:.1e} of the right side, not {step.tolerance:g}",
                     stacklevel=4,
                 )
         if step.taken_off != "none":

@@ -44,7 +44,7 @@ class WeighedScan(NamedTuple):
         scan, noise = self
         found = np.zeros((n_stokes, n_pixels))
         within = scan.counted / noise.white[:, None]
-        scan.spread(noise.weigh(y) - within * y, -s, noise.free_modes, found)
+        scan.spread(noise.weigh(y, scan.counted) - within * y, -s, noise.free_modes, found)
         return found
 
 
@@ -54,7 +54,7 @@ class Solution(NamedTuple):
     Attributes
     ----------
     values
-        (n_stokes, n_pixels), K; 0 without samples.
+        (n_stokes, n_pixels), K; 0 without samples. The one with the least residual.
     history
         Norm of the residual after each iteration, over that of the right side.
     ritz
@@ -102,15 +102,19 @@ class NormalEquations:
         return out + self._added([m] * len(self.scans))
 
     def solve(self, right: Floats, tolerance: float, most: int) -> Solution:
-        """Conjugate gradients from 0, at most so many iterations."""
+        """Conjugate gradients from 0, at most so many iterations: the map with the least residual.
+        Behind it, rounding fills patterns that the data do not determine.
+        """
         m, r = np.zeros_like(right), right.copy()
         z = self._preconditioned(r)
         p, product = z.copy(), float((r * z).sum())
         first, history = product, list[float]()
-        steps, turns = list[float](), list[float]()
+        steps, turns, best = list[float](), list[float](), m
         while first > 0 and len(history) < most and (not history or history[-1] >= tolerance):
             q = self.apply(p)
-            step = product / float((p * q).sum())
+            if (curvature := float((p * q).sum())) <= 0:
+                break  # rounding alone is left of a pattern that the data do not determine
+            step = product / curvature
             m += step * p
             r -= step * q
             z = self._preconditioned(r)
@@ -118,8 +122,10 @@ class NormalEquations:
             steps.append(step)
             turns.append(product / before)
             history.append(float(np.sqrt(max(product, 0.0) / first)))
+            if history[-1] == min(history):
+                best = m.copy()
             p = z + turns[-1] * p
-        return Solution(m, history, ritz_values(steps, turns))
+        return Solution(best, history, ritz_values(steps, turns))
 
     def _added(self, of: Sequence[Floats | tuple[Floats, Floats]]) -> Floats:
         """Last three terms of equation (1), added up in order: of a map, or of y and s of the data

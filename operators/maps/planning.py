@@ -99,7 +99,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         stokes = 3 if step.stokes == "IQU" else 1
         runs = (6 if stokes == 1 else 22) * samples * self.runs(observation)
         sums = (40 + 16 * signals) * samples / length + 16 * signals * step.free * instants
-        maps = 8 * (5 + step.refine) * stokes * int(step.grid.n_pixels)
+        maps = 8 * (6 + step.refine) * stokes * int(step.grid.n_pixels)
         return super().memory(observation) + int(2 * runs + sums) + maps
 
     def runs(self, observation: Observation) -> float:

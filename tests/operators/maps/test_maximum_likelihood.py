@@ -294,3 +294,68 @@ def test_flagged_samples_and_detectors_have_no_part():
     one, two = mapped(o, noise), mapped(o, spoilt)
     np.testing.assert_array_equal(one.signal, two.signal)
     np.testing.assert_array_equal(one.hits, two.hits)
+
+
+def test_gaps_of_all_detectors_change_neither_weights_nor_noise():
+    """Half of each 10 s is flagged: white noise and a load of 20 K."""
+    o, rng = observation(), np.random.default_rng(11)
+    o.flags[np.arange(o.n_samples) % 1000 < 500] = 2
+    found = mapped(o, SIGMA * rng.normal(size=(37, o.n_samples)) + 20.0)
+    ok = found.known & (found.hits > 30)
+    # 37 variances of 3000 samples: 0.4 % of their mean; a line and three modes take little
+    assert np.nanmedian(found.noise * np.sqrt(found.hits)) == pytest.approx(SIGMA, rel=0.02)
+    error = (found.signal / found.noise)[ok]
+    assert error.std() == pytest.approx(1, abs=3 / np.sqrt(2 * ok.sum()) + 0.08)
+
+
+def test_a_load_of_each_detector_leaves_the_map_as_it_is():
+    """The line of a detector is that of the baselines it has: here most lack some."""
+    o, rng = observation(), np.random.default_rng(12)
+    noise = SIGMA * rng.normal(size=(37, o.n_samples))
+    for k in range(37):
+        noise[k, 100 * k : 150 * k] = np.nan
+    load = np.arange(37)[:, None] * 0.1
+    how = {"modes": 0, "free": 0, "refine": 0, "tolerance": 1e-7}
+    with pytest.warns(UserWarning, match="lack up to"):
+        one, two = mapped(o, noise, **how), mapped(o, noise + load, **how)
+    # noise is found from the same baselines to rounding, of 1e-16 of 3.6 K over 1e-3 K and of
+    # fixed-point weights, 2^-30
+    assert np.nanmax(np.abs(one.signal - two.signal)) < 1e-5 * np.nanmedian(one.noise)
+
+
+def test_few_detectors_and_many_modes_keep_the_level_of_white_noise():
+    for n_det, modes in ((1, 3), (2, 2), (37, 20)):
+        o = scan(n_det, 6000, radius=3.0)
+        noise = SIGMA * np.random.default_rng(13).normal(size=(n_det, o.n_samples))
+        found = mapped(o, noise, modes=modes, free=0)
+        # a variance of 5700 degrees of freedom or more: 1 % of sigma; levels that modes tell: 5 %
+        level = np.nanmedian(found.noise * np.sqrt(found.hits))
+        assert level == pytest.approx(SIGMA, rel=0.05), n_det
+
+
+def test_a_detector_without_samples_has_no_part():
+    o, rng = observation(), np.random.default_rng(14)
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(37, o.n_samples))
+    noise[5] = np.nan
+    found = mapped(o, noise)
+    ok = found.known & (found.hits > 50)
+    assert (found.signal / found.noise)[ok].std() < 1.5
+    with pytest.raises(PipelineError, match="no samples count"):
+        mapped(o, np.full_like(noise, np.nan))
+
+
+@pytest.mark.parametrize(
+    ("n", "how", "cause", "cure"),
+    [
+        (10, {}, "has 1 baselines", "shorter baseline"),
+        (300, {}, "has 15 baselines", "shorter baseline"),
+        (6000, {"baseline": "5 ms"}, "one sample", "0.04 s"),
+        (6000, {"width": "6 arcmin"}, "outside the map", "width"),
+    ],
+)
+def test_scans_that_tell_too_little_are_refused(n, how, cause, cure):
+    o = scan(5, n, radius=3.0)
+    noise = SIGMA * np.random.default_rng(15).normal(size=(5, n))
+    with pytest.raises(PipelineError, match=cause) as caught:
+        mapped(o, noise, **how)
+    assert cure in caught.value.cure

@@ -58,7 +58,8 @@ def noise_of(white, free, modes=2, n=N, seed=2):
     none = np.zeros((0, n_base))
     values = np.zeros(modes)
     own = 1 + 20 / f**1.5
-    return BaselineNoise(white, LENGTH, none, q, free, values, f, edges, own, shared, own, white)
+    more = own, shared, own, white, own
+    return BaselineNoise(white, LENGTH, none, q, free, values, f, edges, *more)
 
 
 def dense(pixel, noise):
@@ -84,7 +85,8 @@ def dense(pixel, noise):
             s[k * n + np.arange(n), d * n + np.arange(n)] = a[d]
     s = s @ about
     unit = np.eye(N_DET * n_base).reshape(-1, N_DET, n_base)
-    slow = np.array([noise.weigh(one.copy()).ravel() for one in unit])
+    counted = counts.reshape(N_DET, n_base, -1).sum(axis=2).astype(np.int32)
+    slow = np.array([noise.weigh(one.copy(), counted).ravel() for one in unit])
     return about.T @ white @ about - s.T @ s + mean.T @ slow @ mean
 
 
@@ -224,7 +226,7 @@ def test_spectra_and_modes_are_found():
     white = rng.uniform(1, 4, n_det)
     whitened = series(1 + (0.1 / f) ** 1.5, n_det) + np.outer(u, series(1e4 * (0.1 / f), 1)[0])
     y = whitened * np.sqrt(white / length)[:, None]
-    noise = estimate(y, white, length, rate, modes=2, free=0, trend=1)
+    noise = estimate(y, np.full(y.shape, length), white, length, rate, modes=2, free=0, trend=1)
     assert abs(noise.modes[0] @ u) > 0.999
     at = noise.frequency > 0.02  # below, lines take part of the power
     own, shared = noise.own[at], noise.shared[at, 0]
