@@ -374,7 +374,53 @@ def test_two_runs_into_one_folder(here: Path, capsys: pytest.CaptureFixture[str]
 
 
 # -------------------------------------------------------------------------------------------------
-# signals and clocks
+# streams that nobody reads, signals and clocks
+
+
+def unread() -> Any:
+    """A stream whose reader is gone."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    return open(writer, "w")
+
+
+def test_a_run_that_nobody_reads(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", unread())
+    monkeypatch.setattr(sys, "stderr", unread())
+    assert cli.main(["run", "small.yaml", "--output", "out"]) == 0
+    assert {"noise_map.fits", "resolved.yaml"} <= set(whole(here / "out"))
+    assert cli.main(["pipelines"]) == 0
+    assert cli.main(["check", "nothing.yaml"]) == 2
+    sys.stdout.close()  # raises nothing: what was in its buffer is gone, as at the end of Python
+    sys.stderr.close()
+
+
+def test_a_command_without_streams(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert cli.main(["check", "small.yaml"]) == 0
+    assert cli.main(["check", "nothing.yaml"]) == 2
+    assert sys.stdout is sys.stderr is None
+
+
+def full() -> Any:
+    return open("/dev/full", "w")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
+def test_streams_that_are_full(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An answer that cannot be written is an error, a warning is not."""
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", full())
+        assert cli.main(["pipelines"]) == 2
+        sys.stdout.close()
+    assert capsys.readouterr().err == "error: No space left on device\n"
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", full())
+        assert cli.main(["run", "small.yaml", "--output", "out"]) == 0
+        sys.stderr.close()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent as POSIX does")

@@ -49,18 +49,22 @@ def check_links(folder: Path, job: Job | None = None) -> None:
     """Raise `OutputError` where a folder of the campaign, inside its output folder, is a link to
     another one.
     """
-    names = [TASKS, ENTRIES, INPUTS]
-    if job is not None:
-        names += [combination.folder for combination in job.combinations]
-        names += [f"{ENTRIES}/{k:06d}" for k in range(len(job.entries))]
     root = folder.resolve()
-    for name in names:
+    for name in _subfolders(job):
         if (root / name).resolve() != root / name:
             raise OutputError(
                 "is reached through a link, and what it leads to may be somebody else's",
                 place=str(folder / name),
                 cure="remove the link, or choose another output folder",
             )
+
+
+def _subfolders(job: Job | None) -> Iterator[str]:
+    """Names of the folders that a campaign writes to, inside its output folder ('')."""
+    yield from ("", TASKS, ENTRIES, INPUTS)
+    if job is not None:
+        yield from (combination.folder for combination in job.combinations)
+        yield from (f"{ENTRIES}/{k:06d}" for k in range(len(job.entries)))
 
 
 def _remove_tasks(folder: Path) -> None:
@@ -112,11 +116,12 @@ def publish(job: Job, folder: Path) -> None:
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def clean(folder: Path) -> None:
-    """Remove temporary files that killed workers left anywhere in the folder. No worker may be
-    active there.
+def clean(folder: Path, job: Job) -> None:
+    """Remove temporary files that killed workers left in the folders of a campaign: other folders
+    there may be those of runs at work. No worker may be active there.
     """
-    for path in [p for p in folder.rglob(".*.part*") if PART.search(p.name)]:
+    found = [path for name in _subfolders(job) for path in (folder / name).glob(".*.part*")]
+    for path in [path for path in found if PART.search(path.name)]:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
         else:

@@ -100,7 +100,7 @@ def resume(
     strict = job.same_machine if same_machine is None else same_machine
     check_unchanged(job, folder, anyway)
     share_out(pool, job.need, job.name)
-    clean(folder)
+    clean(folder, job)
     record = Record(job, folder)
     for number, combination in enumerate(job.combinations):
         layout = layout_path(folder, number)
@@ -199,7 +199,7 @@ def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> Ca
     ready = [n for n in range(len(job.combinations)) if n not in incomplete | set(record.combined)]
     with written.recording(folder, anew=False):
         Combinations(record, result, pool).carry_out(ready)
-    clean(folder)  # of workers that were killed while they wrote
+    clean(folder, job)  # of workers that were killed while they wrote
     _fail(result, len(job.tasks))
     if missing := len(job.tasks) - len(record.done):
         raise PipelineError(

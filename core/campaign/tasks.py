@@ -279,7 +279,7 @@ class Tasks(Work[Task, Outcome]):
             with contextlib.suppress(Exception):
                 self.record.put_off()
             if self.pool.stop():
-                clean(self.folder)
+                clean(self.folder, self.record.job)
             raise
         finally:
             hooks.manager().hook.zonda_campaign_end()

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -123,7 +123,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; the exit status: 0, 1 (a plugin's fault), 2 (a user's mistake), 128 + a
     signal that ended it.
     """
-    with _plain_warnings(), _stoppable():
+    with _unbroken_streams(), _plain_warnings(), _stoppable():
         try:
             result = zonda.main(arguments, prog_name="zonda", standalone_mode=False)
             return result if isinstance(result, int) else 0
@@ -169,6 +169,59 @@ def _clear() -> None:
     """Clear the line that a progress plugin may have left."""
     if sys.stderr.isatty():
         click.echo("\r\033[K", nl=False, err=True)
+
+
+class _Unbroken:
+    """A standard stream that drops what nobody can read any more.
+
+    ``lossy``: what cannot be written for another cause, such as a full disk, is dropped, too.
+    """
+
+    def __init__(self, stream: Any, lossy: bool) -> None:
+        self._stream, self.lossy = stream, lossy
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write text; the number of letters."""
+        self._try(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        self._try(self._stream.flush)
+
+    def _try(self, function: Callable[..., Any], *arguments: str) -> None:
+        try:
+            function(*arguments)
+        except OSError as err:
+            if not (self.lossy or err.errno in (errno.EPIPE, errno.EIO)):
+                raise
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())  # what is buffered is written at the end
+            os.close(nowhere)
+
+
+@contextlib.contextmanager
+def _unbroken_streams() -> Iterator[None]:
+    """Let a command end as it would where a standard stream is closed or its reader is gone."""
+    usual: Any = (sys.stdout, sys.stderr)
+    with contextlib.ExitStack() as opened:
+        taken = [
+            # a closed one; else a file of the run would take its number
+            opened.enter_context(open(os.devnull, "w")) if stream is None else stream
+            for stream in usual
+        ]
+        made: list[Any] = [_Unbroken(taken[0], lossy=False), _Unbroken(taken[1], lossy=True)]
+        sys.stdout, sys.stderr = made
+        try:
+            yield
+        finally:
+            sys.stdout, sys.stderr = usual
+            for stream in made:
+                stream.lossy = True  # what could not be written has been told
+                stream.flush()
 
 
 @contextlib.contextmanager

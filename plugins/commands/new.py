@@ -134,15 +134,16 @@ def _write_folder(folder: Path, texts: dict[str, str]) -> None:
     import os
     import shutil
 
-    from zonda.core.storage.files import temporary_sibling
+    from zonda.core.storage.files import temporary_sibling, writing
 
     draft = temporary_sibling(folder)
     try:
-        for inside, text in texts.items():
-            path = draft / inside
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
-        os.rename(draft, folder)
+        with writing(folder):
+            for inside, text in texts.items():
+                path = draft / inside
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text, encoding="utf-8")
+            os.rename(draft, folder)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
 

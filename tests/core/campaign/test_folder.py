@@ -1,5 +1,8 @@
 """What a killed worker leaves."""
 
+import shutil
+from types import SimpleNamespace
+
 import pytest
 
 from zonda.core.campaign.campaign_file import FILE, digest_of_text
@@ -7,16 +10,20 @@ from zonda.core.campaign.folder import clean
 from zonda.core.storage import files
 from zonda.core.storage.files import temporary_sibling
 
+JOB = SimpleNamespace(combinations=[SimpleNamespace(folder="site=atacama")], entries=[None, None])
 
-def test_half_written_files_go_wherever_they_are(tmp_path):
-    for where in ("", "tasks", "entries/000001", "site=atacama"):
+
+def test_half_written_files_go_from_folders_of_the_campaign(tmp_path):
+    for where in ("", "tasks", "entries/000001", "site=atacama", "of another run"):
         folder = tmp_path / where
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "map.fits").write_text("whole")
         (folder / ".mine.part").write_text("of somebody else")
         temporary_sibling(folder / "map.fits").write_text("half")
         temporary_sibling(folder / "tod").mkdir()
-    clean(tmp_path)
+    clean(tmp_path, JOB)
+    assert len(list((tmp_path / "of another run").iterdir())) == 4  # it may be at work
+    shutil.rmtree(tmp_path / "of another run")
     assert sorted({p.name for p in tmp_path.rglob("*") if p.is_file()}) == [
         ".mine.part",
         "map.fits",
@@ -57,5 +64,5 @@ def test_the_file_that_proves_a_folder_writable_is_removed_after_a_kill(tmp_path
     monkeypatch.setattr(files, "discard", lambda path: None)  # SIGKILL: it never comes to that
     files.check_output_folder(tmp_path / "entries")
     assert len(list((tmp_path / "entries").iterdir())) == 1
-    clean(tmp_path)
+    clean(tmp_path, JOB)
     assert list((tmp_path / "entries").iterdir()) == []
