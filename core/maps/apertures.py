@@ -28,13 +28,13 @@ from typing import Any
 import numpy as np
 
 from ..configuration.target import Target
-from ..configuration.units import Unit
 from ..errors import InputError
 from ..numerics.angles import angle_text
 from ..numerics.sphere import angles, local_axes, unit_vectors
 from ..types import Floats
 from .grid import HealpixPixels, ImagePixels
 from .measured_noise import WHITE, noise_factor
+from .units import angle_of
 
 PARTS = 16
 MOST, FEW = 30, 5
@@ -215,8 +215,15 @@ def aperture_flux(
     """`MapProduct.aperture_flux`."""
     if product.polarization is not None:
         return aperture_flux(product.stokes("I"), radius, centre, annulus, spectral_index)
-    inner, outer = annulus or (0.0, 0.0)
-    sizes = [Unit("rad").parse(each) if each else 0.0 for each in (radius, inner, outer)]
+    call = "map.aperture_flux('1 arcmin', annulus=('2 arcmin', '3 arcmin'))"
+    ring = () if annulus is None else annulus
+    pair = annulus is None or (
+        hasattr(ring, "__len__") and not isinstance(ring, str) and len(ring) == 2
+    )
+    sizes = [angle_of(each, call) for each in (radius, *(ring if pair else ()))]
+    if not pair or sizes != sorted(sizes) or sizes[1:2] == sizes[2:] != []:
+        wrong = "annulus has an inner and an outer radius: radius <= inner < outer"
+        raise InputError(wrong, place="map.aperture_flux", cure=f"write {call}")
     where = None if centre is None else in_frame(product, Target.parse(centre))
     half = product.half_difference
     alone = None if half is None else (half, f"half the difference, {product.difference}")

@@ -40,13 +40,11 @@ def earlier(folder: Path, inputs: Iterable[Path] = ()) -> list[Path]:
     found = []
     for name, stamps in _read(folder).items():
         path = root / name
-        if os.path.realpath(path.parent) != str(path.parent) or str(path) in kept:
-            continue  # behind a link, or read by this run
-        try:
-            about = os.lstat(path)
-        except OSError:
-            continue  # removed since
-        if not stat.S_ISREG(about.st_mode) or (about.st_size, about.st_mtime_ns) not in stamps:
+        if str(path) in kept:
+            continue  # read by this run
+        if (unchanged := _unchanged(path, stamps)) is None:
+            continue
+        if not unchanged:
             raise OutputError(
                 "was changed after the run that wrote it, and this run would replace or remove it",
                 place=str(folder / name),
@@ -57,10 +55,14 @@ def earlier(folder: Path, inputs: Iterable[Path] = ()) -> list[Path]:
 
 
 def clear(folder: Path, old: Iterable[Path]) -> None:
-    """Remove files that `earlier` found, the folders that this empties, and the record."""
-    root = folder.resolve()
+    """Remove files that `earlier` found and that were not changed since, the folders that this
+    empties, and the record.
+    """
+    root, stamps = folder.resolve(), _read(folder)
     with files.writing(folder):
         for path in old:
+            if not _unchanged(path, stamps.get(path.relative_to(root).as_posix(), set())):
+                continue
             path.unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # the others are not empty
                 for parent in path.parents:
@@ -137,12 +139,27 @@ class Record:
                 if not any(os.path.lexists(root / name) for name in self._new):
                     (root / NAME).unlink()
         gone = [
-            name for p in self._old or () if (name := str(p.relative_to(root))) not in self._new
+            name
+            for p in self._old or ()
+            if (name := str(p.relative_to(root))) not in self._new and not os.path.lexists(p)
         ]
         if gone and self._new:
             more = f" and {len(gone) - 6} more" if len(gone) > 6 else ""
             text = f"removed {', '.join(gone[:6])}{more}: of an earlier run, this one makes none"
             warnings.warn(f"{self.folder}: {text}", stacklevel=4)
+
+
+def _unchanged(path: Path, stamps: set[Stamp]) -> bool | None:
+    """True for a file that has one of the stamps; None where it was removed, or a link leads to
+    it.
+    """
+    if os.path.realpath(path.parent) != str(path.parent):
+        return None
+    try:
+        about = os.lstat(path)
+    except OSError:
+        return None
+    return stat.S_ISREG(about.st_mode) and (about.st_size, about.st_mtime_ns) in stamps
 
 
 def _read(folder: Path) -> dict[str, set[Stamp]]:
@@ -156,9 +173,10 @@ def _read(folder: Path) -> dict[str, set[Stamp]]:
     except FileNotFoundError:
         return {}
     for line in lines:
-        with contextlib.suppress(ValueError, TypeError, RecursionError):
+        with contextlib.suppress(ValueError, TypeError, OverflowError, RecursionError):
             name, size, changed = json.loads(line)
             inside = isinstance(name, str) and "\0" not in name and not Path(name).is_absolute()
+            os.fsencode(name)
             if inside and Path(name).parts and ".." not in Path(name).parts:
                 found.setdefault(name, set()).add((int(size), int(changed)))
     return found

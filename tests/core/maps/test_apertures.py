@@ -146,6 +146,26 @@ def test_without_values_there_is_no_flux():
         replace(product.to("K_RJ"), band=None).aperture_flux("21 arcsec")
 
 
+@pytest.mark.parametrize(
+    ("radius", "annulus"),
+    [
+        (0, None),
+        (None, None),
+        ("-1 arcmin", None),
+        ("1 Jy", None),
+        ("1 arcmin", "2 arcmin"),
+        ("1 arcmin", 5.0),
+        ("1 arcmin", ("3 arcmin", "2 arcmin")),
+        ("1 arcmin", ("2 arcmin", "2 arcmin")),
+        ("1 arcmin", ("30 arcsec", "50 arcsec")),
+    ],
+)
+def test_what_is_no_circle_or_ring_is_refused(radius, annulus):
+    with pytest.raises(InputError, match=r"map\.aperture_flux") as caught:
+        grid("CAR", 4).aperture_flux(radius, annulus=annulus)
+    assert "annulus=('2 arcmin', '3 arcmin')" in caught.value.cure
+
+
 def test_weights_of_an_annulus_sum_to_nothing():
     product = grid("CAR", 4)
     known = np.ones(product.hits.shape, bool)

@@ -71,6 +71,28 @@ def test_a_file_that_was_changed_is_refused(tmp_path, how):
     assert names(tmp_path) == before
 
 
+@pytest.mark.parametrize("how", ["file", "link"])
+def test_a_file_that_is_changed_while_the_run_is_at_work_stays(tmp_path, how):
+    """Minutes lie between the look at the folder and the first product."""
+    run(tmp_path, "map.fits", "sub/other.fits")
+    (tmp_path / "elsewhere").mkdir()
+
+    def work() -> None:
+        with written.recording(tmp_path, anew=True):
+            if how == "file":
+                (tmp_path / "map.fits").write_text("precious, and of the user")
+            else:
+                (tmp_path / "sub").rename(tmp_path / "elsewhere" / "sub")
+                (tmp_path / "sub").symlink_to("elsewhere/sub")
+            write_text(tmp_path / "new.fits", "")
+
+    gone = "sub/other.fits" if how == "file" else "map.fits"
+    with pytest.warns(UserWarning, match=f"removed {gone}: of an earlier run"):
+        work()
+    kept = {"map.fits"} if how == "file" else {"elsewhere/sub/other.fits"}
+    assert names(tmp_path) - {"sub/other.fits"} == {"new.fits", *kept}
+
+
 def test_files_that_the_run_reads_stay(tmp_path):
     run(tmp_path, "tod.h5", "map.fits")
     run(tmp_path, "new.fits", inputs=(tmp_path / "tod.h5",))
@@ -101,7 +123,8 @@ def test_a_run_that_was_killed_leaves_files_that_the_next_one_knows(tmp_path, mo
 
 
 @pytest.mark.parametrize(
-    "name", ["../victim", "/etc/hostname", "sub/../../victim", ".", "", "link/victim", "a\0b", 5]
+    "name",
+    ["../victim", "/etc/hostname", "sub/../../victim", ".", "", "link/victim", "a\0b", "\ud800", 5],
 )
 def test_a_record_that_was_made_up_reaches_nothing_outside(tmp_path, name):
     out, victim = tmp_path / "out", tmp_path / "victim"
@@ -109,7 +132,14 @@ def test_a_record_that_was_made_up_reaches_nothing_outside(tmp_path, name):
     victim.write_text("precious")
     (out / "link").symlink_to(tmp_path)
     about = victim.stat()
-    lines = [json.dumps([name, about.st_size, about.st_mtime_ns]), "[", "{}", '["a"]', "[" * 9999]
+    lines = [
+        json.dumps([name, about.st_size, about.st_mtime_ns]),
+        "[",
+        "{}",
+        '["a"]',
+        "[" * 9999,
+        '["a", Infinity, 1]',
+    ]
     (out / written.NAME).write_text("\n".join(lines))
     run(out, "map.fits")
     assert victim.read_text() == "precious"
