@@ -15,6 +15,7 @@ from engine import fuzz, guided_by, scratch, told
 with guided_by(
     "zonda.operators.sky",
     "zonda.operators.io",
+    "zonda.core.maps",
     "zonda.core.numerics.projection",
     "zonda.core.storage.fits_files",
     "astropy.io.fits",
@@ -23,7 +24,9 @@ with guided_by(
     from astropy.io import fits
     from fuzz_hdf5 import tiny_scan, whole
 
+    from zonda import read_map as read_product
     from zonda.core.errors import ZondaError
+    from zonda.operators.diagnostics.comparison.files import read_planes
     from zonda.operators.io.save_tod import load_tod, save_tod
     from zonda.operators.sky.input_map import HealpixMap
     from zonda.operators.sky.read import read_map
@@ -43,6 +46,11 @@ def target(data: bytes) -> None:
             return
         whole(tod)
         return
+    for read in (read_product, read_planes):
+        try:
+            read(FILE)  # type: ignore[operator]
+        except ZondaError as err:
+            told(err)
     by_header = {"header_alone": True}
     for options in (
         {},
@@ -263,12 +271,17 @@ def seeds() -> Iterator[bytes]:
         header=image.header,
         compression_type="RICE_1",
     )
+    plate_carree = fits.PrimaryHDU(image.data, image.header)
+    plate_carree.header.update(
+        {"CTYPE1": "GLON-CAR", "CTYPE2": "GLAT-CAR", "CRVAL2": 0.0, "CRPIX2": -1198.0}
+    )
     for hdus in (
         [image],
         [fits.PrimaryHDU(), table],
         [fits.PrimaryHDU(), partial],
         [fits.PrimaryHDU(), packed],
         [fits.PrimaryHDU(), squeezed],
+        [plate_carree],
     ):
         fits.HDUList(hdus).writeto(FILE, overwrite=True)
         yield FILE.read_bytes()

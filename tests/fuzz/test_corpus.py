@@ -18,6 +18,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from zonda.core import cli
+
 HERE = Path(__file__).parent
 FUZZERS = ("yaml", "fits", "hdf5", "text")
 CORPUS = sorted(p for name in FUZZERS for p in (HERE / "corpus" / name).glob("*"))
@@ -116,6 +118,55 @@ def test_damage_at_random_places(name: str, seed: int, how: str) -> None:
 @given(seed=st.integers(0, 2**32), how=st.sampled_from(HOW))
 def test_damage_at_many_places(name: str, seed: int, how: str) -> None:
     damage(name, seed, how)
+
+
+MAP = """\
+site: green_bank
+instrument: mustang2
+time: 2024-11-25T07:00
+target: 05h +20d
+operators:
+  - PointingDaisy: {scan_duration: 0.2 s}
+  - SkyMap: {file: damaged.fits}
+  - BinMap: {pixel: 20 arcsec}
+  - SaveMap
+"""
+
+
+def flipped(data: bytes, seed: int) -> bytes:
+    """``data`` with a bit or some turned over, mostly of values of cards."""
+    rng, made = random.Random(seed), bytearray(data)
+    cards = [at for at in range(0, len(data), 80) if data[at + 8 : at + 10] == b"= "]
+    for _ in range(rng.choice((1, 1, 2, 8))):
+        known = rng.random() < 0.8
+        at = rng.choice(cards) + rng.randrange(10, 32) if known else rng.randrange(len(made))
+        made[at] ^= 1 << rng.randrange(rng.choice((4, 8)))
+    return bytes(made)
+
+
+def flip(seed: int) -> int:
+    """Compare a map with its damaged copy, and observe it: done, or a user's mistake (2)."""
+    every = whole("fits")[:3] + whole("fits")[5:6]
+    data = every[seed % len(every)]
+    Path("whole.fits").write_bytes(data)
+    Path("damaged.fits").write_bytes(flipped(data, seed))
+    Path("p.yaml").write_text(MAP)
+    assert cli.main(["compare", "whole.fits", "damaged.fits", "--output", "out"]) in (0, 2)
+    status = cli.main(["run", "p.yaml", "--output", "run"])
+    assert status in (0, 2)
+    return status
+
+
+def test_flipped_bits_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert {flip(seed) for seed in range(106, 110)} == {0, 2}
+
+
+@pytest.mark.nightly
+def test_many_flipped_bits_of_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for seed in range(200, 600):
+        flip(seed)
 
 
 CHILD = """
