@@ -15,9 +15,8 @@ import numpy as np
 
 from .canvas import SEQUENCE, finish, new_figure, unit_of, wide_legend
 from .focalplane import Focalplane
-from .numerics.angles import ARCMIN, angle_text
 from .numerics.projection import boresights
-from .numerics.sphere import local_axes
+from .numerics.sphere import ARCMIN, angle_text, local_axes
 from .tables import aligned
 from .types import AnyFloats, Floats
 

@@ -20,7 +20,7 @@ from zonda.core import registry
 from zonda.core.checks import Case, Check, Family, Result, registered
 from zonda.core.cli import main
 from zonda.plugins.checks import machine
-from zonda.plugins.checks.cases import MACHINE
+from zonda.plugins.checks.scenes import MACHINE
 
 from .checks import covariance, matrix
 from .checks.cases import MATRIX

@@ -5,8 +5,8 @@ import pytest
 
 import zonda
 from zonda.core import cli
-from zonda.core.numerics.angles import ARCSEC
 from zonda.core.numerics.projection import rotation_matrices
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.operators.diagnostics.transfer_function import compare, window_of
 
 CUT = 0.08  # Hz

@@ -16,7 +16,7 @@ from zonda_atmosphere import observation
 import zonda
 from zonda.core.data import Block
 from zonda.core.instrument import SPEED_OF_LIGHT
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.atmosphere.turbulence.beams import widened
 

@@ -16,7 +16,7 @@ apertures of this kind on the map (noise that is correlated between pixels count
     e^2 = f^2 sum_p w_p^2 n_p^2,   f^2 = mean_k F_k(noise)^2 / sum_p w_kp^2 n_p^2                (2)
 
 with up to `MOST` circles k beside each other; where fewer than `FEW` lie in the map, f is that of
-single pixels (`measured_noise.noise_factor`), and 1 where nothing holds noise alone.
+single pixels (`planes.noise_factor`), and 1 where nothing holds noise alone.
 """
 
 from __future__ import annotations
@@ -29,11 +29,10 @@ import numpy as np
 
 from ..configuration.target import Target
 from ..errors import InputError
-from ..numerics.angles import angle_text
-from ..numerics.sphere import angles, local_axes, unit_vectors
+from ..numerics.sphere import angle_text, angles, local_axes, unit_vectors
 from ..types import Floats
 from .grid import HealpixPixels, ImagePixels
-from .measured_noise import WHITE, noise_factor
+from .planes import WHITE, noise_factor
 from .units import angle_of
 
 PARTS = 16

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..errors import InputError
-from ..numerics.angles import ARCSEC
+from ..numerics.sphere import ARCSEC
 from ..types import Floats
 
 UNIT = 1 << 10

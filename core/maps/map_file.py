@@ -22,8 +22,7 @@ from ..storage.fits_files import header_of, joined, table_bytes, write_image
 from ..versions import versions
 from .header import exact_header
 from .map_arrays import MapArrays
-from .measured_noise import ELSEWHERE, stated
-from .planes import Plane
+from .planes import ELSEWHERE, Plane, stated
 from .units import scale_of
 
 CONVENTION = "COSMO"

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from ..canvas import DPI, PALE, log_labels, unit_of
 from ..configuration.diagnostics import nearest
 from ..errors import InputError
-from ..numerics.angles import angle_text
+from ..numerics.sphere import angle_text
 from ..types import AnyFloats
 from .grid import wcs_grid
-from .map_arrays import MapArrays
-from .on_plane import on_plane
+from .map_arrays import MapArrays, on_plane
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS

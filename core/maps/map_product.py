@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..numerics.angles import FWHM_PER_SIGMA, angle_text, sides_text
+from ..numerics.sphere import FWHM_PER_SIGMA, angle_text, sides_text
 from ..tables import html_table
 from ..types import Floats
 from .map_arrays import MapArrays
-from .measured_noise import central_diameter
+from .planes import central_diameter
 from .smoothing import CUT, error_of_mean, smoother, weighted_mean
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 from ..signal import Signal
 from ..types import Floats
 from .map_product import MapProduct
-from .measured_noise import ELSEWHERE, central_diameter, stated
+from .planes import ELSEWHERE, central_diameter, stated
 
 Noise = Literal["half_difference", "source_free"]
 """What holds noise alone: half the difference of two halves of the samples, the map of the signal

@@ -21,8 +21,7 @@ from .header import FileHeader, exact_header, with_known_frame
 from .map_file import Provenance
 from .map_product import MapProduct
 from .map_reading import Cube, HealpixTable, chosen, is_healpix, q_and_u
-from .measured_noise import ELSEWHERE
-from .planes import KNOWN, Plane, ScanHits
+from .planes import ELSEWHERE, KNOWN, Plane, ScanHits
 from .units import KNOWN_UNITS, written_unit
 
 ABOUT = (

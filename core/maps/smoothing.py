@@ -1,4 +1,4 @@
-"""Smoothing of maps with a Gaussian on the sphere.
+"""Smoothing of maps with a Gaussian, on the sphere and on plain images.
 
 A Gaussian of FWHM sqrt(8 ln 2) sigma on the sky, r the angle between two directions,
 is the kernel
@@ -19,10 +19,56 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..kernels import kernel
-from ..numerics.angles import FWHM_PER_SIGMA, angle_text
-from ..numerics.transforms import convolved, convolved_rows, gaussian_taps
+from ..numerics.sphere import FWHM_PER_SIGMA, angle_text
 from ..types import AnyFloats, Floats
 from .grid import ROWS, HealpixPixels, ImagePixels, MapGrid
+
+
+def gaussian_taps(sigma: float) -> Floats:
+    """(n,) the middle and one side of a Gaussian of ``sigma`` pixels, cut at 5 sigma, of sum 1 over
+    both sides.
+    """
+    reach = math.ceil(5 * sigma)
+    kernel = (
+        np.exp(-(np.arange(-reach, reach + 1) ** 2) / (2 * sigma**2)) if sigma > 0 else np.ones(1)
+    )
+    return np.asarray(kernel / kernel.sum())[reach:]
+
+
+def convolved(values: AnyFloats, taps: AnyFloats, along: AnyFloats | None = None) -> AnyFloats:
+    """An image (ny, nx) convolved along both axes with a symmetric kernel; nothing lies outside.
+    All of one type.
+
+    ``along``: taps along x, where they are not those along y.
+    """
+    across = np.ascontiguousarray(_along_columns(values, taps).T)
+    return np.ascontiguousarray(_along_columns(across, taps if along is None else along).T)
+
+
+def convolved_rows(values: Floats, taps: Floats, rows: list[Floats]) -> Floats:
+    """Convolve as `convolved` does, with a kernel of its own along each row (``rows``); ``taps`` is
+    for the columns.
+    """
+    n = values.shape[1]
+    along = np.empty_like(values)
+    for values_of, own, out in zip(values, rows, along, strict=True):
+        reach = min(len(own) - 1, n - 1)
+        out[:] = np.convolve(values_of, np.concatenate([own[reach:0:-1], own[: reach + 1]]))[
+            reach : reach + n
+        ]
+    return np.asarray(_along_columns(along, taps))
+
+
+def _along_columns(values: AnyFloats, taps: AnyFloats) -> AnyFloats:
+    """sum_k taps[|k|] values[j + k] along the first axis; zeros beyond the ends."""
+    out: AnyFloats = values * taps[0]
+    part = np.empty_like(values)
+    for k in range(1, min(len(taps), len(values))):
+        np.multiply(values, taps[k], out=part)
+        out[k:] += part[:-k]
+        out[:-k] += part[k:]
+    return out
+
 
 Smoother = Callable[..., Floats]
 """f(values, power=1.0): values, shape of the grid, convolved with the power-th power of equation

@@ -149,6 +149,10 @@ class Planning(Generic[O]):
         """
         return 0
 
+    def held(self, observation: Observation, threads: int, spilled: int = 0) -> int:
+        """Bytes that the step holds for a scan, besides streams and blocks, with all threads."""
+        return self.memory(observation) + threads * self.per_thread(observation, spilled)
+
     def finished(self, observation: Observation) -> tuple[int, int]:
         """Bytes while the product is finished, and of the product then; `memory` is what is held
         of it before.

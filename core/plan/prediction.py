@@ -19,7 +19,7 @@ from ..data import Data, Observation
 from ..mapmaker import joins, made_by, makes_products
 from ..operator import Operator
 from ..output import Output
-from ..run.budget import BASE, at_end, held
+from ..run.budget import BASE, at_end
 from ..run.schedule import Schedule, does_the_same, schedule
 from ..run.settings import Settings
 from ..run.views import View
@@ -55,8 +55,10 @@ def memory_of(contexts: Sequence[Context], settings: Settings) -> float:
         views.append(View(context.chain, longest))
         steps = [o for o in context.operators if not isinstance(o, Output)]
         pointed += POINTED * context.times
-        sizes.append(sum(held(o, longest, threads) for o in steps))
-        products.append(sum(held(o, longest, threads) for o in steps if makes_products(o)))
+        sizes.append(sum(planning_of(o).held(longest, threads) for o in steps))
+        products.append(
+            sum(planning_of(o).held(longest, threads) for o in steps if makes_products(o))
+        )
     outputs = {o.label: o for c in contexts for o in c.operators if isinstance(o, Output)}
     base, end = BASE + pointed, sum(at_end(views, list(outputs.values())).values())
 
@@ -67,8 +69,8 @@ def memory_of(contexts: Sequence[Context], settings: Settings) -> float:
     alone = [blocks([view], own) for view, own in zip(views, sizes, strict=True)]
     for k, (view, one) in enumerate(zip(views, alone, strict=True)):  # copies of what is on disk
         sizes[k] += one.mapped + sum(
-            held(o, view.observation, threads, one.spilled) - held(o, view.observation, threads)
-            for o in view.chain.steps
+            each.held(view.observation, threads, one.spilled) - each.held(view.observation, threads)
+            for each in map(planning_of, view.chain.steps)
         )
     joined, rest = any(map(joins, views[0].chain.steps)), blocks(views, sum(sizes))
     if len(views) > 1 and (

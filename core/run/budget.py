@@ -14,13 +14,11 @@ import numpy as np
 from ..errors import PipelineError
 from ..machine import available_memory, resident_memory
 from ..mapmaker import joins, makes_products
-from ..observation import Observation
 from ..operator import Operator
 from ..output import Output
 from ..plan.planning import planning_of
-from .prefetch import Ahead
 from .schedule import Schedule, does_the_same, schedule
-from .settings import Settings, megabytes
+from .settings import Ahead, Settings, megabytes
 from .views import Band, View
 
 BASE = 240_000_000
@@ -34,12 +32,6 @@ BLOCKS = "blocks on 1 thread"
 KEPT = "kept streams"
 OTHERS = "maps of other bands"
 FEWER = "keep fewer streams, of fewer or shorter scans"
-
-
-def held(step: Operator, observation: Observation, threads: int, spilled: int = 0) -> int:
-    """Bytes that a step holds for a scan, besides streams and blocks."""
-    planning = planning_of(step)
-    return planning.memory(observation) + threads * planning.per_thread(observation, spilled)
 
 
 def at_end(views: Sequence[View], outputs: Sequence[Operator]) -> dict[str, int]:
@@ -56,16 +48,13 @@ def at_end(views: Sequence[View], outputs: Sequence[Operator]) -> dict[str, int]
     for sums, finishing, product in each:
         work = max(work, kept + before - sums + finishing)
         kept, before = kept + product, before - sums
-    observation, most = views[0].observation, max(outputs, key=_per_pixel, default=None)
-    parts = {o.label: planning_of(o).memory(observation) for o in outputs}
-    if most is not None:
-        parts[most.label] += _per_pixel(most) * pixels
-    acting = {PRODUCTS: kept} | parts
-    return acting if sum(acting.values()) > work else {PRODUCTS: work}
-
-
-def _per_pixel(step: Operator) -> int:
-    return planning_of(step).per_pixel
+    acting = {o.label: planning_of(o) for o in outputs}
+    parts = {label: planning.memory(views[0].observation) for label, planning in acting.items()}
+    if acting:
+        most = max(acting, key=lambda label: acting[label].per_pixel)
+        parts[most] += acting[most].per_pixel * pixels
+    parts |= {PRODUCTS: kept}
+    return parts if sum(parts.values()) > work else {PRODUCTS: work}
 
 
 def check_end(bands: Sequence[Band], operators: Sequence[Operator], settings: Settings) -> None:
@@ -200,11 +189,11 @@ def divided(views: Sequence[View], settings: Settings, kept: int = 0, others: in
 
 
 def _of_steps(views: Sequence[View], threads: int, spilled: int = 0) -> dict[str, int]:
-    """What steps hold, by label, of all bands."""
+    """Bytes that steps hold, by label, of all bands."""
     parts: dict[str, int] = {}
     for view in views:
         for o in view.chain.steps:
-            size = held(o, view.observation, threads, spilled)
+            size = planning_of(o).held(view.observation, threads, spilled)
             parts[o.label] = parts.get(o.label, 0) + size
     return parts
 
@@ -214,7 +203,7 @@ def memory_of(views: Sequence[View], threads: int, products: bool = False) -> in
     ``products``: what they add up over all scans alone.
     """
     return sum(
-        held(o, view.observation, threads)
+        planning_of(o).held(view.observation, threads)
         for view in views
         for o in view.chain.steps
         if makes_products(o) or not products

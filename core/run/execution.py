@@ -49,10 +49,9 @@ from ..types import AnyFloats
 from .block_maker import BlockMaker, Due
 from .budget import divide, memory_of
 from .means import MeansOfBands, WholeStream, knows_means, means_of
-from .prefetch import Ahead
 from .schedule import Schedule, schedule
 from .segments import Segment, Source, least_block, pieces
-from .settings import Settings, Timer
+from .settings import Ahead, Settings, Timer
 from .streams import Store, StreamMadeAgain
 from .views import Band, View
 
@@ -163,7 +162,7 @@ class Execution:
             self._close()
 
     def prepare(self) -> None:
-        """Configure and prepare all steps; perhaps while another scan is executed (`prefetch`)."""
+        """Configure and prepare all steps; perhaps while another scan is executed (`Ahead`)."""
         for view in self.views:
             for operator in view.chain.steps:
                 operator.configure(view.observation)

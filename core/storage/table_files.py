@@ -57,8 +57,8 @@ HOURS = frozenset({"h", "hr", "hour", "hours", "hourangle", "h:m:s", "hms"})
 MOST_TOLD = 12
 """Mistakes that are told one by one; the others are counted."""
 BRACKETED = re.compile(
-    r"(.*?)\s*(?:\[(.*)\]|\((degs?|degrees?|°|rad|radians?|arcmin|arcsec|s|secs?|seconds?|h|hours?|%"
-    r"|[kMGT]?Hz|[mu]?Jy|[kcmu]?m|h?Pa|K)\))"
+    r"(.*?)\s*(?:\[(.*)\]|\((degs?|degrees?|°|rad|radians?|arcmin|arcsec|s|secs?|seconds?"
+    r"|h|hours?|%|[kMGT]?Hz|[mu]?Jy|[kcmu]?m|h?Pa|K)\))"
 )
 """Name and unit of a column's heading; only such units stand in round brackets."""
 SPELLED = {

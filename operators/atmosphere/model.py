@@ -19,8 +19,8 @@ from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSec
 from zonda.core.data import Data
 from zonda.core.errors import InputError, ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band, Telescope
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA
 from zonda.core.observation import LoadSpectra, Observation
 from zonda.core.operator import Operator
 from zonda.core.registry import spectra

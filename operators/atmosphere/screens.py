@@ -24,7 +24,7 @@ from zonda.core.canvas import Sketch, shown_axes
 from zonda.core.configuration.units import Seconds
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA
 from zonda.core.output import Output, Progress
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.storage.fits_files import header_of, write_image

@@ -17,8 +17,8 @@ from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import Noise, is_quiet, maps_of, noise_alone
 from zonda.core.maps.smoothing import smoother
-from zonda.core.numerics.angles import beam_area
 from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.numerics.sphere import beam_area
 from zonda.core.output import Output
 from zonda.core.storage.files import product_path
 

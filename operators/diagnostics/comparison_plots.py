@@ -22,7 +22,7 @@ from zonda.core.maps.map_plots import (
     range_of,
     wcs_of,
 )
-from zonda.core.numerics.angles import ARCSEC, angle_text
+from zonda.core.numerics.sphere import ARCSEC, angle_text
 
 from .compare_streams import StreamComparison
 from .map_spectra import MapSpectra

@@ -26,9 +26,8 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_sources
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.projection import frame_rotation, pixel_matrix
-from zonda.core.numerics.sphere import local_axes
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA, local_axes
 from zonda.core.output import Output
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats

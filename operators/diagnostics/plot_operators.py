@@ -19,6 +19,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
+from zonda.core.maps.map_arrays import on_plane
 from zonda.core.maps.map_plots import (
     SHOWN,
     SIGNED,
@@ -34,12 +35,11 @@ from zonda.core.maps.map_plots import (
     wcs_of,
 )
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.measured_noise import central_diameter, in_beams
 from zonda.core.maps.noise_figures import Noise, maps_of, noise_alone, noise_sources
-from zonda.core.maps.on_plane import on_plane
+from zonda.core.maps.planes import central_diameter, in_beams
 from zonda.core.maps.smoothing import smoother
 from zonda.core.maps.units import parse_unit
-from zonda.core.numerics.angles import angle_text, sides_text
+from zonda.core.numerics.sphere import angle_text, sides_text
 from zonda.core.output import MapOutput, output_folder
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.types import AnyFloats, Floats

@@ -20,10 +20,10 @@ from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.figures import Figures
 from zonda.core.maps.beams import expected_fwhm
-from zonda.core.maps.measured_noise import central_diameter, in_beams
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
-from zonda.core.numerics.angles import ARCSEC, angle_text, beam_area, sides_text
+from zonda.core.maps.planes import central_diameter, in_beams
 from zonda.core.numerics.radiation import to_kelvin_rj
+from zonda.core.numerics.sphere import ARCSEC, angle_text, beam_area, sides_text
 from zonda.core.operator import Operator
 from zonda.core.output import Output, output_folder
 from zonda.core.registry import declared, operators
@@ -309,7 +309,7 @@ def flux_density(kelvin: float, fwhm: float, band: Band) -> str:
 
 
 def results(data: Data, given: float | None) -> tuple[dict[str, str], list[Row]]:
-    """How much was observed, by name; how noisy and how deep the maps are.
+    """Amount that was observed, by name; noise and depth of the maps.
 
     ``given`` is the diameter [rad] of the circle in which that is taken; None stands for
     `central_diameter` of each map.

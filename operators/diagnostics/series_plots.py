@@ -22,7 +22,7 @@ from zonda.core.canvas import (
     unit_of,
     wide_legend,
 )
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.core.plots import draw_stream, draw_tracks
 from zonda.core.stream import unit_of_stream
 from zonda.core.types import AnyFloats

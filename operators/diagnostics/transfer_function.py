@@ -33,7 +33,7 @@ from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import ARCSEC, FWHM_PER_SIGMA
 from zonda.core.output import Output
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.storage.table_files import Column

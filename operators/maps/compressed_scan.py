@@ -1,4 +1,4 @@
-"""What a maximum-likelihood map needs of a scan: baselines, runs of samples in one pixel, and what
+"""A scan as a maximum-likelihood map needs it: baselines, runs of samples in one pixel, and what
 detectors have in common at the full rate.
 
 Samples d_i of a detector are cut into baselines b of L samples, which begin at multiples of L. Of
@@ -128,7 +128,7 @@ class RunsOfTiles:
         self._tiles.append((rows, tile))
 
     def scan(self, rate: float) -> CompressedScan:
-        """All runs, detector by detector; the tiles are used up."""
+        """Runs of all tiles, detector by detector; the tiles are used up."""
         first = np.zeros(self.number.size + 1, np.int64)
         np.cumsum(self.number.ravel(), out=first[1:])
         at = first[:-1].reshape(self.number.shape)[:, 0].copy()

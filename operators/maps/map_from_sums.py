@@ -19,8 +19,8 @@ from zonda.core.maps.map_file import Provenance
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import is_quiet
 from zonda.core.maps.planes import ScanHits
-from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.chunks import empty
+from zonda.core.numerics.sphere import angle_text
 from zonda.core.signal import MAIN, product_name
 from zonda.core.types import AnyFloats, Floats
 

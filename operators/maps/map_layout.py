@@ -18,8 +18,7 @@ import numpy as np
 
 from zonda.core.data import Observation
 from zonda.core.errors import InputError, PipelineError
-from zonda.core.numerics.angles import ARCSEC
-from zonda.core.numerics.sphere import local_axes, unit_vectors
+from zonda.core.numerics.sphere import ARCSEC, local_axes, unit_vectors
 from zonda.core.types import Floats
 
 from .grid import (

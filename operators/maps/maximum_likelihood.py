@@ -107,7 +107,7 @@ class MaximumLikelihoodMap(BinMap):
 
     @property
     def taken_off(self) -> Literal["none", "mean", "plane"]:
-        """What is taken off the map of I."""
+        """The name of the pattern that is taken off the map of I."""
         return self.undetermined or ("plane" if self.kind == "TAN" else "mean")
 
     def observe(self, data: Data) -> None:
@@ -133,7 +133,7 @@ class MaximumLikelihoodMap(BinMap):
             )
 
     def prepare(self, observation: Observation) -> LikelihoodScan:  # type: ignore[override]
-        """What is found out of one observation.
+        """Pixels and baselines of one observation, before its samples are read.
 
         Raises PipelineError where a window has changed the samples, for samples outside the map,
         and for too few or too short baselines.
@@ -501,7 +501,7 @@ class LikelihoodMaps(MapFromSums):
 
     @cached_property
     def equations(self) -> NormalEquations:
-        """Those of all scans, with the noise of data minus the map."""
+        """Normal equations of all scans, with the noise of data minus the map."""
         found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
         step = self.parameters
         for _ in range(step.refine):
@@ -554,7 +554,7 @@ class LikelihoodMaps(MapFromSums):
 
     @property
     def _taken(self) -> str:
-        """What is taken off, as products state it."""
+        """`taken_off`, as products state it."""
         return self.parameters.taken_off.removeprefix("none")
 
     def _determined(self, values: Floats, equations: NormalEquations) -> Floats:

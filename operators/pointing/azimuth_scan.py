@@ -17,8 +17,7 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.types import Floats
 
 from .base import Aim, Pointing
-from .observed import mark_turnarounds
-from .sun_and_moon import mark_sun
+from .observed import mark_sun, mark_turnarounds
 from .sweep import Sweep
 
 if TYPE_CHECKING:

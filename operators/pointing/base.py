@@ -28,8 +28,7 @@ from zonda.core.types import Floats
 
 from .limits import LargestMotion, check_elevation, excess, what_fits, when_up
 from .motion import POINTS, LargestDerivative, Quantity, SamplesPerBeam, motion
-from .observed import centre_of, observed, plot_step, report, state_times, transform_of
-from .sun_and_moon import distances
+from .observed import centre_of, distances, observed, plot_step, report, state_times, transform_of
 
 if TYPE_CHECKING:
     from zonda.core.configuration.time import Instant

@@ -35,8 +35,7 @@ from zonda.core.types import Floats
 from .base import Scans
 from .limits import LargestMotion, check_elevation
 from .motion import POINTS, LargestDerivative, Quantity, motion
-from .observed import mark_turnarounds, observed, transform_of
-from .sun_and_moon import sunlit
+from .observed import mark_turnarounds, observed, sunlit, transform_of
 from .sweep import Nod, Sweep
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width, size_text
 from zonda.core.maps.header import SMALLEST_PIXEL, FileHeader
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit
-from zonda.core.numerics.angles import ARCSEC, angle_text
 from zonda.core.numerics.radiation import BOLTZMANN
+from zonda.core.numerics.sphere import ARCSEC, angle_text
 from zonda.core.types import Floats
 
 from .input_map import InputMap

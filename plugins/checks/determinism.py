@@ -25,8 +25,7 @@ from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.pointing.daisy import PointingDaisy
 
-from .cases import BLOCKS, TWICE
-from .scenes import camera, differing, scene
+from .scenes import BLOCKS, TWICE, camera, differing, scene
 
 checks = Family("determinism")
 

@@ -14,8 +14,7 @@ from zonda.core.checks import Family, Measured
 from zonda.core.machine import command
 from zonda.core.versions import arithmetic
 
-from .cases import DISPATCH
-from .scenes import camera, scene, sky_file
+from .scenes import DISPATCH, camera, scene, sky_file
 
 checks = Family("dispatch")
 

@@ -13,7 +13,7 @@ import numpy as np
 from zonda.core.checks import Family, Measured
 from zonda.core.kernels import folder
 
-from .cases import MACHINE
+from .scenes import MACHINE
 
 checks = Family("machine")
 

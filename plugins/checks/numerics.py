@@ -23,8 +23,7 @@ from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.operators.noise.streams import Streams
 
-from .cases import DECADES, PINK, TIME
-from .scenes import largest, run, scan
+from .scenes import DECADES, PINK, TIME, largest, run, scan
 
 checks = Family("numerics")
 

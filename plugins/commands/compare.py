@@ -327,7 +327,7 @@ def fluxes(
 
     from zonda.core.errors import InputError
     from zonda.core.maps.units import parse_unit
-    from zonda.core.numerics.angles import angle_text
+    from zonda.core.numerics.sphere import angle_text
     from zonda.operators.diagnostics.comparison.files import in_unit
 
     rows, jansky = [], math.nan
@@ -351,7 +351,7 @@ def fluxes(
 
 def lines(found: Comparison, more: Sequence[tuple[str, str]] = ()) -> list[str]:
     """The table as text, with ``more`` rows."""
-    from zonda.core.numerics.angles import angle_text
+    from zonda.core.numerics.sphere import angle_text
     from zonda.core.tables import aligned
 
     f = found.values

@@ -28,8 +28,8 @@ def doctor(as_json: bool) -> None:
     one_blas_thread()
     from zonda.core.checks import measure, registered
     from zonda.core.tables import aligned
-    from zonda.plugins.checks.cases import MACHINE
     from zonda.plugins.checks.machine import description
+    from zonda.plugins.checks.scenes import MACHINE
 
     chosen = sorted(
         registered(), key=lambda check: check.case is not MACHINE

@@ -113,7 +113,7 @@ def when(
         click.echo("\n".join(lines(seen, year)))
     if as_json and output is None:
         return
-    from .when_plots import when_figure
+    from .weather_plots import when_figure
 
     path = product_path(output or "out/when", f"{name}_{place.name}", ".png")
     draw(when_figure(seen, year), path, err=as_json)

@@ -15,7 +15,7 @@ from zonda.core.errors import InputError
 from zonda.core.experiment.experiment import Experiment
 from zonda.core.experiment.variant import Variant
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA
 from zonda.core.pipeline import Pipeline
 from zonda.core.signal import product_name, stream_of
 from zonda.core.tables import aligned

@@ -17,7 +17,7 @@ import numpy as np
 
 from zonda.core.canvas import COLOURS, DPI
 from zonda.core.errors import InputError
-from zonda.core.numerics.angles import ARCMIN, ARCSEC, angle_text
+from zonda.core.numerics.sphere import ARCMIN, ARCSEC, angle_text
 from zonda.core.storage.files import atomic_path, check_output_folder, write_text
 from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.tables import aligned, html_table

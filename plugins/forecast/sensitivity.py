@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
-from zonda.core.numerics.angles import ARCMIN
+from zonda.core.numerics.sphere import ARCMIN
 from zonda.core.registry import instruments
 
 from . import calculator, default_pipeline, detector_noise

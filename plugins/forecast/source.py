@@ -36,9 +36,8 @@ from scipy.ndimage import correlate1d
 from zonda.core.configuration.input_paths import find_in
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
-from zonda.core.numerics.angles import angle_text
 from zonda.core.numerics.projection import frame_rotation
-from zonda.core.numerics.sphere import angle_between, angles, unit_vectors
+from zonda.core.numerics.sphere import angle_between, angle_text, angles, unit_vectors
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.maps.grid import tangent_wcs
 from zonda.operators.sky.convolved import Beam, tangent_areas

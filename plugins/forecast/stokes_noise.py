@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.block import Block
-from zonda.core.numerics.transforms import convolved, gaussian_taps
+from zonda.core.maps.smoothing import convolved, gaussian_taps
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.maps.binning import BandBlock, Binning, Weights, add_blocks

@@ -20,8 +20,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.focalplane import Focalplane
 from zonda.core.mapmaker import makes_products
 from zonda.core.maps.beams import expected_fwhm
-from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.core.numerics.projection import frame_rotation, pixel_matrix, ray_coefficients
+from zonda.core.numerics.sphere import ARCMIN, FWHM_PER_SIGMA
 from zonda.core.observation import Observation, WhiteLevel
 from zonda.core.operator import Operator
 from zonda.core.output import is_output

@@ -20,7 +20,7 @@ from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
 from zonda.core.maps.apertures import Aperture, ApertureFlux, flux_within, in_frame
 from zonda.core.maps.noise_figures import is_quiet, maps_of, noise_alone
-from zonda.core.numerics.angles import angle_text
+from zonda.core.numerics.sphere import angle_text
 from zonda.core.signal import Signal, product_name, stream_of
 
 from .common import map_of, needs_signal, sky_alone

@@ -15,7 +15,7 @@ from zonda.core.maps.grid import ImagePixels, wcs_grid
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.smoothing import smoothed, smoother
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.types import Floats
 

@@ -54,8 +54,8 @@ from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.measured_noise import WHITE, central_diameter
-from zonda.core.numerics.angles import ARCMIN, angle_text
+from zonda.core.maps.planes import WHITE, central_diameter
+from zonda.core.numerics.sphere import ARCMIN, angle_text
 from zonda.core.signal import Signal
 from zonda.core.types import Floats
 from zonda.operators.diagnostics.comparison.statistics import Comparison

@@ -17,9 +17,8 @@ from zonda.core.experiment.experiment import Values
 from zonda.core.storage.files import atomic_path, write_text
 from zonda.core.tables import Table, render
 
-from .claims import ClaimsFile
+from .claims import LIMIT, ClaimsFile
 from .rows import CounterResult, Row
-from .verdict import LIMIT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -26,8 +26,7 @@ from zonda.operators.atmosphere.weather.sources import profile_of
 from zonda.plugins.commands.weather_plots import plot_spectrum
 
 from .calculations import Amount
-from .claims import FOLDER, Claim, Experiment
-from .verdict import Comparison, Verdict, compare, contradicted, decide
+from .claims import FOLDER, Claim, Comparison, Experiment, Verdict, compare, contradicted, decide
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

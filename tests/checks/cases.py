@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from zonda.core.checks import Case
-from zonda.plugins.checks.cases import BLOCKS, DECADES, DISPATCH, PINK, TIME, TWICE
+from zonda.plugins.checks.scenes import BLOCKS, DECADES, DISPATCH, PINK, TIME, TWICE
 
 NEAR = Case(
     "structure function as r -> 0",

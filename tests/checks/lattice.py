@@ -14,8 +14,7 @@ from zonda.core.checks import Family, Measured
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, beam_structure
 from zonda.operators.atmosphere.turbulence.lattice import Turbulence
 from zonda.operators.atmosphere.turbulence.levels import FIDELITIES
-from zonda.plugins.checks.cases import BLOCKS
-from zonda.plugins.checks.scenes import differing, largest
+from zonda.plugins.checks.scenes import BLOCKS, differing, largest
 
 from .cases import FAR, OVERLAP, STRIP
 from .implied import implied_covariance

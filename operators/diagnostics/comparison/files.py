@@ -37,12 +37,11 @@ from zonda.core.maps.map_reading import (
     polarized_letter,
     q_and_u,
 )
-from zonda.core.maps.measured_noise import ELSEWHERE
 from zonda.core.maps.noise_figures import FREE
-from zonda.core.maps.planes import IQU
+from zonda.core.maps.planes import ELSEWHERE, IQU
 from zonda.core.maps.units import KNOWN_UNITS, parse_unit, scale_of
-from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA, beam_area
 from zonda.core.numerics.radiation import cmb_slope, intensity_to_kelvin, thermal_sz
+from zonda.core.numerics.sphere import ARCSEC, FWHM_PER_SIGMA, beam_area
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.storage.files import atomic_path
 from zonda.core.storage.fits_files import check_size, header_of, joined, opened, write_image

@@ -32,13 +32,12 @@ from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
+from zonda.core.maps.map_arrays import on_plane
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.measured_noise import ELSEWHERE, WHITE, noise_factor
-from zonda.core.maps.on_plane import on_plane
+from zonda.core.maps.planes import ELSEWHERE, WHITE, noise_factor
 from zonda.core.maps.smoothing import smoothed
-from zonda.core.numerics.angles import FWHM_PER_SIGMA, angle_text
 from zonda.core.numerics.projection import pixel_matrix
-from zonda.core.numerics.sphere import angles, local_axes
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA, angle_text, angles, local_axes
 from zonda.core.types import Floats
 
 SAME = 1e-4

@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.core.storage.table_files import Column
 from zonda.core.types import AnyFloats, Floats
 

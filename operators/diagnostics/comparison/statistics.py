@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from zonda.core.maps.apertures import COMPLETE, Aperture
 from zonda.core.maps.grid import ImagePixels, MapGrid, image_grid
-from zonda.core.numerics.angles import beam_area
-from zonda.core.numerics.sphere import angles
+from zonda.core.numerics.sphere import angles, beam_area
 from zonda.core.types import Floats
 
 from .planes import Plane, cell_of, common, on_a_plane

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from zonda.core.campaign.table import Point, draw
+from zonda.core.campaign.run import Point, draw
 from zonda.core.configuration.diagnostics import ConfigurationError
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.experiment.experiment import Values

@@ -10,8 +10,7 @@ import pytest
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import HealpixPixels, image_grid, wcs_grid
 from zonda.core.maps.smoothing import smoothed, smoother
-from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
-from zonda.core.numerics.sphere import separation, unit_vectors
+from zonda.core.numerics.sphere import ARCMIN, FWHM_PER_SIGMA, separation, unit_vectors
 
 ZENITHAL = ("TAN", "SIN", "ZEA", "ARC", "STG")
 CYLINDRICAL = ("CAR", "CEA", "MER")

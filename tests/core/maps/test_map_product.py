@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import ARCMIN
+from zonda.core.numerics.sphere import ARCMIN
 from zonda.operators.maps.grid import tangent_wcs
 
 ARCSEC = np.pi / 648000

@@ -11,7 +11,7 @@ from zonda.core.instrument import Band
 from zonda.core.maps.map_plots import plot_map
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.smoothing import smoothed
-from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import ARCMIN, FWHM_PER_SIGMA
 from zonda.operators.diagnostics.report import expected
 from zonda.operators.maps.grid import PlateCarreeGrid, tangent_wcs
 from zonda.operators.maps.plate_carree import box_about, centre_of

@@ -7,12 +7,7 @@ import pytest
 
 import zonda
 from zonda.core.instrument import Band, Instrument, Telescope
-from zonda.operators.atmosphere.closed_form import (
-    KNOTS,
-    WAVE_NUMBERS,
-    between_knots,
-    layer_spectrum,
-)
+from zonda.operators.atmosphere.layers import KNOTS, WAVE_NUMBERS, between_knots, layer_spectrum
 from zonda.operators.atmosphere.turbulence.beams import Aperture
 from zonda.operators.atmosphere.turbulence.covariance import beam_correlation, mixture
 from zonda.operators.atmosphere.turbulence.nodes import Layer

@@ -17,7 +17,7 @@ from zonda.core.assembly.checks import run_checks
 from zonda.core.errors import PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.operators.diagnostics.compare_maps import CompareMaps
 from zonda.operators.diagnostics.comparison.files import plane_of, read_planes
 from zonda.operators.diagnostics.comparison.radial import radial_spectra

@@ -12,8 +12,8 @@ from astropy.io import fits
 
 import zonda
 from zonda.core import cli
-from zonda.core.maps.measured_noise import WHITE
 from zonda.core.maps.noise_figures import FREE, maps_of, noise_stated
+from zonda.core.maps.planes import WHITE
 from zonda.operators.diagnostics.comparison.files import read_planes
 from zonda.operators.diagnostics.plot_operators import Plots, _of_maps, _snr
 

@@ -17,6 +17,7 @@ from matplotlib.text import Text
 from zonda.core.canvas import file_of
 from zonda.core.errors import OutputError
 from zonda.core.maps.image import Image
+from zonda.core.maps.map_arrays import on_plane
 from zonda.core.maps.map_plots import (
     map_axes,
     plot_circle,
@@ -24,7 +25,6 @@ from zonda.core.maps.map_plots import (
     plot_map,
 )
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.on_plane import on_plane
 from zonda.operators.diagnostics.plot_operators import Flat, Plots
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 from zonda.operators.diagnostics.series import TimeStream, TimeStreams

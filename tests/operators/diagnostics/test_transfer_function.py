@@ -10,7 +10,7 @@ import pytest
 import zonda
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.core.storage.table_files import write_ecsv
 from zonda.operators.diagnostics.plot_operators import Plots, pictures
 from zonda.operators.diagnostics.series_plots import draw

@@ -13,7 +13,7 @@ import zonda
 from zonda.core.canvas import file_of, new_axes
 from zonda.core.maps.map_plots import plot_contours
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.operators.diagnostics.plot_operators import Plots, _snr
 from zonda.plugins.checks import scenes
 

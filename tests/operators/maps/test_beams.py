@@ -10,8 +10,8 @@ import pytest
 
 from zonda.core.maps.beams import Beams, effective_fwhm
 from zonda.core.maps.map_file import MapFile
-from zonda.core.numerics.angles import ARCMIN, FWHM_PER_SIGMA
 from zonda.core.numerics.projection import directions
+from zonda.core.numerics.sphere import ARCMIN, FWHM_PER_SIGMA
 from zonda.core.storage.fits_files import header_of
 from zonda.operators.maps.bin_map import BinMap
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 import zonda
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import INVALID
-from zonda.core.numerics.angles import ARCMIN
 from zonda.core.numerics.projection import directions, frame_rotation
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.numerics.sphere import ARCMIN
 from zonda.operators.filters.highpass import HighpassFilter
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.intensity_kernel import VALUE, WEIGHT

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 import zonda
 from zonda.core.errors import InputError
-from zonda.core.numerics.angles import ARCMIN, ARCSEC
 from zonda.core.numerics.projection import directions
-from zonda.core.numerics.sphere import separation
+from zonda.core.numerics.sphere import ARCMIN, ARCSEC, separation
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import PlateCarreeGrid
 from zonda.operators.maps.map_layout import MapLayout, checked

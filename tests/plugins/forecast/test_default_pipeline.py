@@ -8,7 +8,7 @@ import pytest
 
 from zonda.core import registry
 from zonda.core.errors import PointingError, ZondaError
-from zonda.core.numerics.angles import ARCMIN, ARCSEC
+from zonda.core.numerics.sphere import ARCMIN, ARCSEC
 from zonda.plugins.forecast.default_pipeline import daisy, make, text
 
 M2 = {"instrument": "mustang2", "site": "green_bank", "month": 11}

@@ -11,8 +11,8 @@ import zonda
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import ZondaError
 from zonda.core.instrument import SPEED_OF_LIGHT, Band
-from zonda.core.numerics.angles import ARCMIN, ARCSEC, FWHM_PER_SIGMA
 from zonda.core.numerics.radiation import BOLTZMANN, cmb_slope
+from zonda.core.numerics.sphere import ARCMIN, ARCSEC, FWHM_PER_SIGMA
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.noise.one_over_f import power_law_filter
 from zonda.plugins.forecast import detector_noise

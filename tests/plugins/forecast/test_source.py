@@ -11,7 +11,7 @@ import zonda
 from zonda.core import cli
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import ZondaError
-from zonda.core.numerics.angles import ARCMIN, ARCSEC, FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import ARCMIN, ARCSEC, FWHM_PER_SIGMA
 from zonda.operators.maps.grid import tangent_wcs
 from zonda.plugins.forecast import source as forecast
 from zonda.plugins.forecast.source import Source

@@ -12,7 +12,7 @@ import zonda
 from zonda.core import cli
 from zonda.core.configuration.pipeline_file import load, parse
 from zonda.core.errors import InputError, PipelineError
-from zonda.core.numerics.angles import ARCMIN, ARCSEC
+from zonda.core.numerics.sphere import ARCMIN, ARCSEC
 from zonda.plugins.forecast import stokes_noise
 from zonda.plugins.forecast.depth import PARTS, WITHIN
 

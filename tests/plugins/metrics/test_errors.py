@@ -12,7 +12,7 @@ from zonda.core.accuracy import metrics
 from zonda.core.errors import InputError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA
 from zonda.operators.diagnostics.power_spectrum import Spectrum
 
 ARCSEC = np.pi / 648000

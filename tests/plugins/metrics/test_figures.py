@@ -16,9 +16,8 @@ from zonda.core.errors import ZondaError
 from zonda.core.figures import Choice, Figures, measure
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.numerics.angles import FWHM_PER_SIGMA
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.numerics.sphere import separation
+from zonda.core.numerics.sphere import FWHM_PER_SIGMA, separation
 from zonda.operators.diagnostics.power_spectrum import Spectrum, Welch
 from zonda.plugins.checks import scenes
 from zonda.plugins.metrics.common import as_seen

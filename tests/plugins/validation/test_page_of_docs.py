@@ -3,8 +3,7 @@
 import importlib.util
 from pathlib import Path
 
-from zonda.plugins.validation.claims import SHIPPED, read
-from zonda.plugins.validation.verdict import Verdict
+from zonda.plugins.validation.claims import SHIPPED, Verdict, read
 
 DOCS = Path(__file__).parents[3] / "docs"
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from zonda.core.errors import ZondaError
 from zonda.core.experiment.experiment import Values
-from zonda.plugins.validation.rows import combined
-from zonda.plugins.validation.verdict import (
+from zonda.plugins.validation.claims import (
     LIMIT,
     Stated,
     Verdict,
@@ -19,6 +18,7 @@ from zonda.plugins.validation.verdict import (
     decide,
     distance,
 )
+from zonda.plugins.validation.rows import combined
 
 numbers = st.floats(-1e6, 1e6)
 

@@ -15,8 +15,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 
 from zonda.core.errors import InputError
-from zonda.core.numerics.angles import ARCSEC, FWHM_PER_SIGMA
-from zonda.core.numerics.sphere import separation, unit_vectors
+from zonda.core.numerics.sphere import ARCSEC, FWHM_PER_SIGMA, separation, unit_vectors
 from zonda.operators.diagnostics.comparison.files import in_unit, read_planes
 from zonda.operators.diagnostics.comparison.planes import cell_of
 from zonda.operators.diagnostics.comparison.statistics import compare

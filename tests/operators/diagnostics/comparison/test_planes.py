@@ -7,7 +7,7 @@ import pytest
 from astropy.coordinates import SkyCoord
 
 from zonda.core.errors import InputError
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.operators.diagnostics.comparison.planes import Plane, common, positions
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from zonda.core.numerics.angles import ARCSEC
+from zonda.core.numerics.sphere import ARCSEC
 from zonda.operators.diagnostics.comparison.planes import Plane
 from zonda.operators.diagnostics.comparison.radial import (
     profiles,
