@@ -51,7 +51,6 @@ from .fluctuations import AtNodes, OfDetectors
 from .model import AtmosphereModel, ExpectedLoad, LayerParameters, Models
 from .realization import draw, state_drawn
 from .resolution import layer_speeds
-from .screens import screens
 from .turbulence.covariance import NU, mixture
 from .turbulence.nodes import Layer
 from .weather.radiative_transfer import ELEVATION_MIN
@@ -291,6 +290,8 @@ class AtmosphereLayers(LayerParameters):
         sees it (`AtmosphereScreens`), and return the matplotlib Axes. Raises InputError for a layer
         that there is not.
         """
+        from .screens import screens
+
         data = Data(scene)
         pointing.observe(data)
         scan = data.observations[0].of_each_band()[0]
