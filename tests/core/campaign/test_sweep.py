@@ -67,7 +67,7 @@ def test_it_is_resumed_and_its_own_yaml_makes_it_again(path, tmp_path, monkeypat
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(run.table, "write", interrupted)
+        patch.setattr(run, "write_table", interrupted)
         assert command("run", path, "--output", folder) == 130
     assert not (folder / "sweep.ecsv").exists()
     assert command("resume", folder) == 0
