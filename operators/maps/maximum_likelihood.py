@@ -480,14 +480,16 @@ class LikelihoodMaps(MapFromSums):
             rows = np.nan_to_num(product.planes["signal"].values)
             values = np.zeros((len(rows), self.grid.n_pixels))
             values[:, self._seen] = rows.reshape(len(rows), -1)
-            signal = self._determined(values, equations)
+            signal = self._determined(values, equations, product)
             return replace(
                 product.with_planes(signal=self._rows(product, signal)), taken_off=self._taken
             )
         solution = self._solved(equations, stream)
-        planes = {"signal": self._rows(product, self._determined(solution.values, equations))}
+        planes = {
+            "signal": self._rows(product, self._determined(solution.values, equations, product))
+        }
         if self.halves:
-            (one, first), (two, second) = (self._half(stream, k) for k in range(2))
+            (one, first), (two, second) = (self._half(stream, k, product) for k in range(2))
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = np.sqrt(equations.spread / (first.spread + second.spread))
                 values = np.where(
@@ -541,11 +543,11 @@ class LikelihoodMaps(MapFromSums):
         right = equations.right_side(binned / self.layout["variance"], data)
         return equations.solve(right, self.parameters.tolerance, MOST_ITERATIONS)
 
-    def _half(self, stream: str, half: int) -> tuple[Floats, NormalEquations]:
+    def _half(self, stream: str, half: int, product: MapProduct) -> tuple[Floats, NormalEquations]:
         """The map of the even or odd scans, and their equations."""
         equations = self._of(self.equations.scans[half::2])
         values = self._solved(equations, stream, half).values
-        return self._determined(values, equations), equations
+        return self._determined(values, equations, product), equations
 
     @property
     def _seen(self) -> Any:
@@ -557,9 +559,17 @@ class LikelihoodMaps(MapFromSums):
         """`taken_off`, as products state it."""
         return self.parameters.taken_off.removeprefix("none")
 
-    def _determined(self, values: Floats, equations: NormalEquations) -> Floats:
-        """A map without what the data hardly determine."""
-        values, weight = values.copy(), equations.weights[0]
+    def _determined(
+        self,
+        values: Floats,
+        equations: NormalEquations,
+        product: MapProduct,
+    ) -> Floats:
+        """A map without what the data hardly determine, as fitted to pixels with values."""
+        values, weight = values.copy(), np.zeros(self.grid.n_pixels)
+        weight[self._seen] = np.where(
+            product.known, equations.weights[0][self._seen].reshape(product.hits.shape), 0.0
+        ).ravel()
         if self.parameters.taken_off == "none":
             return values
         patterns = [np.ones(self.grid.n_pixels)]

@@ -32,6 +32,10 @@ from .stokes_kernel import PLACES
 SINGULAR = 1e-8
 """Of the smallest eigenvalue of the weights in a pixel, as a share of the largest."""
 
+UNDETERMINED = 1e-8
+"""A direction p with less information p^T A p, as a share of that of white noise, p^T W p with the
+weights W of pixels, holds rounding alone."""
+
 
 class WeighedScan(NamedTuple):
     """A scan with its noise."""
@@ -103,17 +107,17 @@ class NormalEquations:
 
     def solve(self, right: Floats, tolerance: float, most: int) -> Solution:
         """Conjugate gradients from 0, at most so many iterations: the map with the least residual.
-        Behind it, rounding fills patterns that the data do not determine.
+        Behind it, and along patterns that the data do not determine, there is rounding alone.
         """
         m, r = np.zeros_like(right), right.copy()
         z = self._preconditioned(r)
         p, product = z.copy(), float((r * z).sum())
         first, history = product, list[float]()
-        steps, turns, best = list[float](), list[float](), m
+        steps, turns, best, size = list[float](), list[float](), m, product
         while first > 0 and len(history) < most and (not history or history[-1] >= tolerance):
             q = self.apply(p)
-            if (curvature := float((p * q).sum())) <= 0:
-                break  # rounding alone is left of a pattern that the data do not determine
+            if (curvature := float((p * q).sum())) <= UNDETERMINED * size:
+                break
             step = product / curvature
             m += step * p
             r -= step * q
@@ -124,7 +128,7 @@ class NormalEquations:
             history.append(float(np.sqrt(max(product, 0.0) / first)))
             if history[-1] == min(history):
                 best = m.copy()
-            p = z + turns[-1] * p
+            p, size = z + turns[-1] * p, product + turns[-1] ** 2 * size
         return Solution(best, history, ritz_values(steps, turns))
 
     def _added(self, of: Sequence[Floats | tuple[Floats, Floats]]) -> Floats:

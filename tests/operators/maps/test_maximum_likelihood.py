@@ -120,6 +120,22 @@ def test_i_q_and_u_come_back(plate):
         assert error.std() < np.nanmedian(one.noise[ok]), name
 
 
+def test_pixels_without_a_value_tilt_no_map_and_undetermined_patterns_stay_small():
+    """Few angles: at the edge Q and I are not told apart. The means of Q and U are not determined, and
+    a load of 20 K leaves a rounding there, which more iterations must not blow up."""
+    rng, o = np.random.default_rng(3), observation(True)
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(37, o.n_samples))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # few angles, and 1e-5 is not reached
+        found = mapped(o, noise, pixel="20 arcsec", stokes="IQU", tolerance=1e-5)
+    assert found.polarization is not None
+    ok = found.known & (found.polarization.condition < 20)
+    for name in "IQU":
+        one = found.stokes(name)
+        # slow noise adds less than half to white noise, as in maps of I
+        assert (one.signal / one.noise)[ok].std() < 1.5, name
+
+
 def test_white_noise_alone_is_weighed_as_it_is():
     """Noise of the map over what it states: that of white noise, since there is no other."""
     rng, o = np.random.default_rng(3), observation()
