@@ -111,13 +111,10 @@ class Sensitivity:
         map that is smoothed with the beam, or of its ``template``
         (`zonda.plugins.forecast.source`). NaN: not forecast.
 
-        Raises InputError where no source was given, and for a time that is not positive.
+        Raises InputError where no source was given, for another ``of``, and for a time that is not
+        positive.
         """
         wanted = self.seconds if seconds is None else seconds
-        if of not in OF:
-            raise InputError(
-                f"no S/N of {of!r}", place="sensitivity", cure="choose: peak, template"
-            )
         if not wanted > 0:
             raise InputError(f"a time of {wanted:g} s is not positive", place="sensitivity")
         return float(self._source("sensitivity").snr(self.depth, wanted, of))

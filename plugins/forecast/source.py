@@ -234,7 +234,13 @@ class Seen:
     def snr(self, depth: Depth, seconds: Floats | float, of: str = "peak") -> Floats:
         """Signal-to-noise ratio after ``seconds``: of the ``peak`` (2), or of the ``template`` (3);
         beyond the scans, and before the first, it grows as time^1/2. NaN: not forecast.
+
+        Raises InputError for another ``of``.
         """
+        if of not in OF:
+            raise InputError(
+                f"no S/N of {of!r}", place="sensitivity", cure=f"choose: {', '.join(OF)}"
+            )
         if of == "peak":
             return np.asarray(abs(self.left(seconds)) / depth.total(seconds))
         wanted = np.asarray(seconds, np.float64)
@@ -242,8 +248,12 @@ class Seen:
         return np.asarray(np.sqrt(rate * wanted))
 
     def reach(self, depth: Depth, sigma: float, of: str = "peak") -> float:
-        """Integration time [s] after which the signal-to-noise ratio is ``sigma``."""
+        """Integration time [s] after which the signal-to-noise ratio is ``sigma``; NaN: it is not
+        forecast.
+        """
         start, end = (float(self.seconds[k]) for k in (0, -1))
+        if math.isnan(float(self.snr(depth, end, of))):
+            return math.nan
         for seconds, beyond in ((end, sigma.__ge__), (start, sigma.__le__)):
             if beyond(found := float(self.snr(depth, seconds, of))):
                 return seconds * (sigma / found) ** 2 if found > 0 else math.inf

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -128,6 +129,11 @@ def test_time_and_signal_to_noise(filtered):
     twice = seen(DAISY, "WhiteNoise", "PinkNoise", "Efficiency", *FILTERS, peak="2 mK")
     assert twice.reach("5 sigma") == pytest.approx(filtered.reach("5 sigma") / 4, rel=1e-3)
     assert twice.snr(of="template") == pytest.approx(2 * filtered.snr(of="template"))
+    unknown = replace(filtered.source, template=np.full_like(filtered.source.template, np.nan))
+    assert math.isnan(replace(filtered, source=unknown).reach("5 sigma", of="template"))
+    for call in (filtered.snr, lambda of: filtered.reach("5 sigma", of=of)):
+        with pytest.raises(ZondaError, match="choose: peak, template"):
+            call(of="tempalte")
 
 
 def test_brightness():
