@@ -14,8 +14,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from ..types import Floats
-from .header import FileHeader, is_celestial, marked_bad
+from .header import FileHeader, is_celestial, marked_bad, with_known_frame
 
 Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
 """Names of frames as astropy has them."""
@@ -156,6 +157,25 @@ def _kind(hdu: Any) -> str:
         return f"table of {header.get('NAXIS2', 0)} rows"
     sides = [str(header.get(f"NAXIS{k + 1}")) for k in range(header.get("NAXIS", 0))]
     return f"image of {' x '.join(sides)}" if sides else "empty"
+
+
+def celestial(hdu: Any, place: str) -> tuple[Cube, Any, str]:
+    """The planes of an image on the sky, its two-dimensional celestial WCS, and the note of
+    `with_known_frame`. Raises InputError where there is no such WCS.
+    """
+    from astropy.wcs import WCS
+
+    header, note = with_known_frame(hdu.header, place)
+    wcs, shape = WCS(header), hdu.shape
+    if not wcs.has_celestial:
+        kinds = ", ".join(str(header.get(f"CTYPE{k}", "none")) for k in (1, 2))
+        message = f"is not a map: it has no celestial coordinates (CTYPE: {kinds})"
+        cure = "give a FITS file with an image that has a celestial WCS, or with a HEALPix table"
+        raise InputError(message, place=place, cure=cure)
+    for axis in range(3, len(shape) + 1):
+        if shape[len(shape) - axis] == 1:  # whatever it is of, there is no choice
+            header[f"CTYPE{axis}"] = ""
+    return Cube(header, place, shape), wcs.celestial, note
 
 
 # --------------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.wcs import WCS
 from numpy.typing import NDArray
 
 from .. import registry
@@ -17,10 +16,10 @@ from ..instrument import Band
 from ..numerics.sphere import angles
 from ..storage.fits_files import check_size, opened
 from .grid import HealpixPixels, wcs_grid
-from .header import FileHeader, exact_header, with_known_frame
+from .header import FileHeader, exact_header
 from .map_file import Provenance
 from .map_product import MapProduct
-from .map_reading import Cube, HealpixTable, chosen, is_healpix, q_and_u
+from .map_reading import HealpixTable, celestial, chosen, is_healpix, q_and_u
 from .planes import ELSEWHERE, KNOWN, Plane, ScanHits
 from .units import KNOWN_UNITS, written_unit
 
@@ -106,17 +105,8 @@ class _Reader(FileHeader):
 
     def read_images(self, all_of_them: bool, plane: tuple[int, ...] | None) -> None:
         """Read an image or the planes of its cube, and the images beside it."""
-        header, _ = with_known_frame(self.header, self.place)
-        wcs = WCS(header)
-        if not wcs.has_celestial:
-            kinds = ", ".join(str(header.get(f"CTYPE{k}", "none")) for k in (1, 2))
-            message = f"is not a map: it has no celestial coordinates (CTYPE: {kinds})"
-            raise self.error(message, "give a FITS file with a map that has a celestial WCS")
-        shape, wcs = self.hdu.shape, wcs.celestial
-        for axis in range(3, len(shape) + 1):
-            if shape[len(shape) - axis] == 1:  # whatever it is of, there is no choice
-                header[f"CTYPE{axis}"] = ""
-        cube = Cube(header, self.place, shape)
+        shape = self.hdu.shape
+        cube, wcs, _ = celestial(self.hdu, self.place)
         index, _ = cube.plane(plane)
         first = "hits" if self.hdu.name == "HITS" else "i"
         places = {first: index, **dict(zip("qu", cube.q_and_u(index), strict=False))}

@@ -24,14 +24,14 @@ import numpy as np
 from zonda.core.errors import InputError
 from zonda.core.maps.beams import check_width
 from zonda.core.maps.grid import HealpixPixels
-from zonda.core.maps.header import FileHeader, with_known_frame
+from zonda.core.maps.header import FileHeader
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_file import ascii_text
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.map_reading import (
     STOKES,
-    Cube,
     HealpixTable,
+    celestial,
     chosen,
     is_healpix,
     polarized_letter,
@@ -339,23 +339,8 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     """A plane or a cube of Stokes parameters, or extensions: with their noise and what holds noise
     alone.
     """
-    from astropy.wcs import WCS
-
-    header, frame = with_known_frame(hdu.header, place)
-    shape = tuple(int(n) for n in hdu.shape)
-    wcs = WCS(header)
-    if not wcs.has_celestial:
-        kinds = ", ".join(str(header.get(f"CTYPE{k}", "none")) for k in (1, 2))
-        raise InputError(
-            f"is not a map: it has no celestial coordinates (CTYPE: {kinds})",
-            place=place,
-            cure="give a FITS file with a two-dimensional image that has a celestial WCS, or with a"
-            " HEALPix table",
-        )
-    for axis in range(3, len(shape) + 1):
-        if shape[len(shape) - axis] == 1:  # whatever it is of, there is no choice
-            header[f"CTYPE{axis}"] = ""
-    cube = Cube(header, place, shape)
+    shape = hdu.shape
+    cube, wcs, frame = celestial(hdu, place)
     index, told = cube.plane(wanted.plane if cube.asked or not wanted.shared else None)
     polarized = cube.q_and_u(index)
     planes = {"I": index, **dict(zip("QU", polarized, strict=False))}
@@ -378,8 +363,8 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     kept = {k: v for k, v in found.items() if both or k[-1] == "I"}
     told["frame"] = frame
     notes = [f"{what}: {told[what]}" for what in ("plane", "frame") if told.get(what)]
-    where = wcs.celestial.to_header(relax=True)
-    return Found(where, kept, header.get("BUNIT"), stated, notes, halves)
+    where = wcs.to_header(relax=True)
+    return Found(where, kept, hdu.header.get("BUNIT"), stated, notes, halves)
 
 
 def _root(variance: Floats) -> Floats:
