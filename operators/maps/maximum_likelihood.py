@@ -117,27 +117,18 @@ class MaximumLikelihoodMap(BinMap):
         self._samples = sum(n for n, _ in every), sum(n for _, n in every)
 
     def check(self, data: Data) -> list[str]:
-        """See `BinMap.check`. Raises PipelineError for a width that leaves samples outside."""
+        """See `BinMap.check`. Raises PipelineError for a width that leaves samples outside, and for
+        too few or too short baselines.
+        """
         found = super().check(data)
+        for observation in data.observations:
+            self._length(observation)
         if self.width is not None and data.observations:
             self._need_all(MapLayout(self).outside(data.observations), self.label)
         return found
 
-    def _need_all(self, outside: float, place: str) -> None:
-        if outside > MOST_OUTSIDE:
-            raise PipelineError(
-                f"{100 * outside:.2g} % of the samples are outside the map, and noise that"
-                " detectors share cannot be told there",
-                place=place,
-                cure="leave width out, or make the map with BinMap",
-            )
-
-    def prepare(self, observation: Observation) -> LikelihoodScan:  # type: ignore[override]
-        """Pixels and baselines of one observation, before its samples are read.
-
-        Raises PipelineError where a window has changed the samples, for samples outside the map,
-        and for too few or too short baselines.
-        """
+    def _length(self, observation: Observation) -> int:
+        """Samples of a baseline. Raises PipelineError for too few or too short baselines."""
         length = max(round(self.baseline * observation.sample_rate), 1)
         number, place = -(-observation.n_samples // length), f"{self.label}, {observation.name}"
         if length < 2:
@@ -155,6 +146,25 @@ class MaximumLikelihoodMap(BinMap):
                 cure=f"set a shorter baseline, of which a scan has {SHORTEST + self.trend} or more;"
                 " or make the map with BinMap",
             )
+        return length
+
+    def _need_all(self, outside: float, place: str) -> None:
+        if outside > MOST_OUTSIDE:
+            raise PipelineError(
+                f"{100 * outside:.2g} % of the samples are outside the map, and noise that"
+                " detectors share cannot be told there",
+                place=place,
+                cure="leave width out, or make the map with BinMap",
+            )
+
+    def prepare(self, observation: Observation) -> LikelihoodScan:  # type: ignore[override]
+        """Pixels and baselines of one observation, before its samples are read.
+
+        Raises PipelineError where a window has changed the samples, for samples outside the map,
+        and for too few or too short baselines.
+        """
+        place = f"{self.label}, {observation.name}"
+        length = self._length(observation)
         if observation.window is not None:
             raise PipelineError(
                 f"{' and '.join(observation.windows)} changed the weight of samples",
