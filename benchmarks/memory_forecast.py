@@ -77,6 +77,11 @@ WIDE = {"radius": "3 deg", "speed": "1 deg/s", "dish": 6, "field": "1 deg", "det
 LARGE = {"detectors": 3000, "dish": 50, "radius": "0.25 deg", "speed": "0.3 deg/s", "rate": 225}
 DENSE = WIDE | {"radius": "0.7 deg", "detectors": 3000, "rate": 100}
 THREE = "runs: {white: {only: [white], modes: full}, pink: {only: [pink], modes: full}}"
+LIKELIHOOD = "\n".join(
+    line
+    for line in scene(detectors=217, duration="60 s", scans=3).splitlines()
+    if "Filter" not in line
+).replace("BinMap", "MaximumLikelihoodMap")
 SCENES: dict[str, tuple[str | list[str], list[str]]] = {
     "19 detectors": (scene(), []),
     "with pictures": (scene(SHOWN), []),
@@ -116,6 +121,8 @@ SCENES: dict[str, tuple[str | list[str], list[str]]] = {
         scene(**LARGE, bins="{pixel: 8 arcsec}", method=", method: mean"),
         ["--memory", "450MB"],
     ),
+    "maximum likelihood": (LIKELIHOOD, ["--set", "MaximumLikelihoodMap.pixel=5 arcsec"]),
+    "there, 1 arcsec": (LIKELIHOOD, ["--set", "MaximumLikelihoodMap.pixel=1 arcsec"]),
     "float64": (scene(more="precision: float64", detectors=217, duration="200 s"), []),
     "mustang2_cluster": (["mustang2_cluster"], []),
     "atlast_reduced, 20 s": (

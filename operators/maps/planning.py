@@ -18,6 +18,8 @@ from .maximum_likelihood import MaximumLikelihoodMap
 
 HEALPY = 32_000_000
 """Bytes of the library."""
+COMPILED = 25_000_000
+"""Bytes of the compiled code of maximum-likelihood maps, and of what the allocator keeps."""
 
 
 class BinMapPlanning(Planning[BinMap]):
@@ -83,24 +85,37 @@ class BinMapPlanning(Planning[BinMap]):
 
 
 class MaximumLikelihoodPlanning(BinMapPlanning):
-    """Runs and baselines of all scans, and the maps of the iteration."""
+    """Runs and baselines of all scans; at the end the maps of the iteration."""
 
     of = MaximumLikelihoodMap
     operator: MaximumLikelihoodMap
     smaller = "choose a larger pixel or a longer baseline"
 
     def memory(self, observation: Observation) -> int:
-        """Six bytes a run (22 with I, Q and U), twice while runs are put in order; sums of
-        baselines and free modes; and maps.
+        """Six bytes a run (22 with I, Q and U), twice while those of a scan are put in order; sums
+        of baselines and free modes; and its compiled code.
         """
         step = self.operator
         samples, instants = step._samples
         signals, length = len(observation.signals), max(step.baseline * observation.sample_rate, 1)
-        stokes = 3 if step.stokes == "IQU" else 1
-        runs = (6 if stokes == 1 else 22) * samples * self.runs(observation)
+        twice = samples + observation.n_samples * observation.n_detectors
+        runs = (22 if self.polarized else 6) * twice * self.runs(observation)
         sums = (40 + 16 * signals) * samples / length + 16 * signals * step.free * instants
-        maps = 8 * (6 + step.refine) * stokes * int(step.grid.n_pixels)
-        return super().memory(observation) + int(2 * runs + sums) + maps
+        return super().memory(observation) + int(runs + sums) + COMPILED
+
+    def finished(self, observation: Observation) -> tuple[int, int]:
+        """Maps of conjugate gradients, and weights with their inverse; of a half difference those
+        of the whole and of one half, too.
+        """
+        most, product = super().finished(observation)
+        stokes, weights = (3, 12) if self.polarized else (1, 2)
+        maps = 15 * stokes + weights + 2 * (stokes + weights) * bool(self.operator.half_difference)
+        return most + 8 * maps * self.pixels, product + COMPILED
+
+    @property
+    def polarized(self) -> bool:
+        """True for maps of I, Q and U."""
+        return self.operator.stokes == "IQU"
 
     def runs(self, observation: Observation) -> float:
         """Runs per sample: the boresight crosses 4 / pi pixels for each pixel of its way, and runs
