@@ -192,7 +192,8 @@ class _Validated:
             try:
                 unit.parse(e["input"])
             except PydanticCustomError as own:  # the same, with the parameter's example
-                e = {**e, "msg": own.message(), "ctx": own.context}
+                if own.message().partition(" such as")[0] == e["msg"].partition(" such as")[0]:
+                    e = {**e, "msg": own.message(), "ctx": own.context}
         message, label = self.message(e, unit, path)
         message = (
             message[:1].lower() + message[1:] if re.match(r"[A-Z][a-z]+\b", message) else message

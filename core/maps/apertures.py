@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydantic_core import PydanticCustomError
 
 from ..configuration.target import Target
 from ..errors import InputError
@@ -223,7 +224,10 @@ def aperture_flux(
     if not pair or sizes != sorted(sizes) or sizes[1:2] == sizes[2:] != []:
         wrong = "annulus has an inner and an outer radius: radius <= inner < outer"
         raise InputError(wrong, place="map.aperture_flux", cure=f"write {call}")
-    where = None if centre is None else in_frame(product, Target.parse(centre))
+    try:
+        where = None if centre is None else in_frame(product, Target.parse(centre))
+    except PydanticCustomError as err:
+        raise InputError(err.message(), place="map.aperture_flux, centre") from None
     half = product.half_difference
     alone = None if half is None else (half, f"half the difference, {product.difference}")
     return flux_within(product, Aperture(*sizes), where, alone, spectral_index)

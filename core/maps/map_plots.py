@@ -79,9 +79,12 @@ class Look:
         if self.colours is not None and self.colours not in colormaps:
             cure = nearest(self.colours, colormaps) or "e.g. inferno, viridis, RdBu_r"
             raise InputError(f"no colour map {self.colours!r}", place=place, cure=cure)
-        low, high = self.limits or (0.0, 1.0)
+        cure = "give the lower, then the upper, numbers in the map's unit"
+        try:
+            low, high = (0.0, 1.0) if self.limits is None else map(float, self.limits)
+        except (TypeError, ValueError):
+            raise InputError(f"{self.limits!r} are no limits", place=place, cure=cure) from None
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
-            cure = "give the lower, then the upper"
             raise InputError(f"{low:g} to {high:g} are no limits", place=place, cure=cure)
         if self.stretch not in STRETCHES:
             cure = f"choose from: {', '.join(STRETCHES)}"

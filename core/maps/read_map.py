@@ -78,8 +78,15 @@ def read_map(
         found, _ = chosen(hdus, hdu, str(path))
         reader = _Reader(found, hdus, str(path))
         if is_healpix(found):
+            if plane is not None:
+                raise reader.error(
+                    "plane is for images", "leave plane out: of a HEALPix table column is chosen"
+                )
             reader.read_table(coordsys, column)
         else:
+            given = {"coordsys": coordsys, "column": column}
+            for name in (name for name, value in given.items() if value is not None):
+                raise reader.error(f"{name} is for HEALPix maps", f"leave {name} out")
             reader.read_images(hdu is None, (plane,) if isinstance(plane, int) else plane)
         return reader.product(unit, band)
 

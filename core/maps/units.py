@@ -43,7 +43,9 @@ def _kelvin_per(product: MapArrays, unit: str, spectral_index: float) -> float |
     if plain == "K_RJ":
         return prefix
     if product.band is None:
-        cure = "convert a map that a run made, or set map.band = zonda.Band(...)"
+        cure = (
+            "convert a map that a run made, or give zonda.read_map(band=) or map.band a zonda.Band"
+        )
         raise InputError(f"the band of the map is not known: no {unit}", place="map", cure=cure)
     if plain == "Jy/beam" and not product.resolution > 0:
         cure = "use MJy/sr, or set map.fwhm, the FWHM of its beam in radian"

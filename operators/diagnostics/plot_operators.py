@@ -172,14 +172,14 @@ def draw_map(
     planes = {"signal": shown.signal} | ({} if snr is None else {"snr": snr[0]})
     flat = Flat.of(shown, planes, style.least_coverage).cropped()
     titles = {
-        "": ("Map", "Everything: sky, atmosphere and noise, filtered and binned."),
+        "": ("Map", "Everything: sky, atmosphere and noise."),
         "noiseless": (
             "Noiseless map",
-            "The sky alone through the same pointing, filters and binning: what the processing"
+            "The sky alone through the same pointing, filters and map maker: what the processing"
             " leaves of it.",
         ),
     }
-    other = f"Map of signal {signal}", "A part of the components, filtered and binned."
+    other = f"Map of signal {signal}", "The signal of this name in `runs`."
     title, meaning = titles.get(signal, other)
     title, how = _named(title, key), _how(product, shown)
     text = f"{meaning} {how[0].upper()}{how[1:]}"

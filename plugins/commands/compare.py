@@ -227,6 +227,7 @@ def _compare(
     apertures: tuple[float, ...],
 ) -> None:
     """One comparison, printed and written to ``folder``."""
+    from zonda.core.errors import InputError
     from zonda.operators.diagnostics.comparison import statistics
     from zonda.operators.diagnostics.comparison.files import (
         Wanted,
@@ -248,6 +249,17 @@ def _compare(
         )
         for k, path in enumerate(paths)
     ]
+    tables = [one.planes["I"].pixels is not None for one in read]
+    cubes = [note for one in read for note in one.notes if note.startswith("plane: ")]
+    for flag, given, there in (
+        ("plane", planes[0] if shared else None, bool(cubes)),
+        ("coordsys", systems[0] if shared else None, any(tables)),
+        ("column", columns[0] if shared else None, any(tables)),
+    ):
+        if given is not None and not there:
+            what = "a cube" if flag == "plane" else "a HEALPix table"
+            cure = f"leave --{flag} out"
+            raise InputError(f"neither of the maps is {what}", place=f"--{flag}", cure=cure)
     names = [_name(path, paths) for path in paths]
     if not read[0].is_of_the_band_of(read[1]):
         bands = " and ".join(

@@ -164,6 +164,8 @@ def test_what_is_no_circle_or_ring_is_refused(radius, annulus):
     with pytest.raises(InputError, match=r"map\.aperture_flux") as caught:
         grid("CAR", 4).aperture_flux(radius, annulus=annulus)
     assert "annulus=('2 arcmin', '3 arcmin')" in caught.value.cure
+    with pytest.raises(InputError, match=r"map\.aperture_flux, centre(.|\n)*as a position"):
+        grid("CAR", 4).aperture_flux("1 arcmin", centre="M31")
 
 
 def test_weights_of_an_annulus_sum_to_nothing():

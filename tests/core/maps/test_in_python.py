@@ -174,10 +174,17 @@ def test_colours_are_the_users(brightness):
     np.testing.assert_allclose(image.get_clim(), (-100, 2000))  # the bar's microkelvin
     pixels = np.ptp(ax.lines[0].get_xdata())
     assert pixels * brightness.sides[0] == pytest.approx(np.radians(1 / 60), rel=1e-3)
-    wrong = {"colours": "magna"}, {"limits": (2, 1)}, {"stretch": "cubic"}, {"scale_bar": "0 deg"}
+    wrong = (
+        {"colours": "magna"},
+        {"limits": (2, 1)},
+        {"limits": 3},
+        {"stretch": "cubic"},
+        {"scale_bar": "0 deg"},
+    )
     texts = (
         "no colour map 'magna'",
         "2 to 1 are no limits",
+        "3 are no limits",
         "no stretch 'cubic'",
         "0 deg is no angle",
     )

@@ -172,6 +172,8 @@ def test_a_map_of_other_origin(tmp_path):
         ({"BMAJ": "wide"}, {}, "BMAJ"),
         ({}, {"hdu": 3}, "no extension 3"),
         ({}, {"band": "nowhere"}, "nowhere"),
+        ({}, {"coordsys": "C"}, "coordsys is for HEALPix maps"),
+        ({}, {"column": 1}, "column is for HEALPix maps"),
     ],
 )
 def test_what_a_file_lacks_is_named(cards, options, words, tmp_path):

@@ -452,6 +452,8 @@ def test_temperatures_that_do_not_fit_are_refused(made, save):
     refused(SkyMap(file=y, unit="K_RJ", te="5 keV"), "te is for maps in y")
     with pytest.raises(ZondaError, match="at most 15 keV"):
         SkyMap(file=y, te="15.1 keV")
+    with pytest.raises(ZondaError, match=r"te: no such file: 'nowhere\.fits'"):
+        SkyMap(file=y, te="nowhere.fits")
 
 
 def test_temperatures_in_kelvin_on_healpix(made, tmp_path):

@@ -290,6 +290,9 @@ def test_a_plane_of_a_cube(tmp_path, values, capsys):
     ):
         assert compare(a, cube, "--output", tmp_path / "o", "--plane", wrong) == 2
         assert words in capsys.readouterr().err
+    for flag, what in (("plane", "a cube"), ("column", "a HEALPix"), ("coordsys", "a HEALPix")):
+        assert compare(a, a, "--output", tmp_path / "o", f"--{flag}", "1") == 2
+        assert f"--{flag}: neither of the maps is {what}" in capsys.readouterr().err
     bad = write(tmp_path / "bad.fits", values, unit="furlong")
     assert compare(cube, bad, "--output", tmp_path / "o", "--plane", "1") == 2
     assert "unknown unit 'furlong'" in capsys.readouterr().err  # not that it is no cube
