@@ -162,6 +162,11 @@ def _pipeline(data: Data, steps: list[Operator]) -> Pipeline:
         for o in acting
         if forms(o) or filters(o) or before.signals.components_of(o)
     ]
+    for step in steps:
+        if before.signals.components_of(step) and not forms(step):
+            text = f"{step.label} makes what the kept signal does not take"
+            cure = "leave it out, or put it into the run that keeps the signal"
+            raise InputError(text, place=PLACE, cure=cure)
     runs = dict(before.asked)
     while True:
         whole = Pipeline(

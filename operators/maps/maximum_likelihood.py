@@ -54,8 +54,6 @@ STEADY, WHITE_LEVELS = 0.75, 3
 """Where fast baselines have less than this share of the power that the scatter within them tells,
 modes that detectors share have a part in that scatter: what baselines tell is taken, and modes are
 sought again, so often at most."""
-LEAST_BASELINES = 10
-"""Of a scan, in which slow noise can be seen."""
 MOST_ITERATIONS = 1000
 """Of conjugate gradients."""
 LOCK = threading.Lock()
@@ -301,13 +299,6 @@ class LikelihoodScan:
         if not self.rows.size:
             raise PipelineError(
                 "no detector is good", place=f"{place}, {observation.name}", cure="look at the log"
-            )
-        if observation.n_samples < LEAST_BASELINES * self.length:
-            raise PipelineError(
-                f"fewer than {LEAST_BASELINES} baselines of {self.length} samples in a scan of"
-                f" {observation.n_samples}: slow noise cannot be seen",
-                place=f"{place}, {observation.name}",
-                cure="set a shorter baseline, or make longer scans",
             )
         self.found = RunsOfTiles(self.rows.size, observation.n_samples, self.length)
         angles = self.prepared.halves[0][0].angles

@@ -112,6 +112,9 @@ def test_mistakes() -> None:
     with pytest.raises(zonda.ZondaError, match="'signal' was not kept") as err:
         zonda.map(data, AGAIN)
     assert "keep=['signal', 'white']" in str(err.value)
+    kept = zonda.Pipeline(STEPS).run(scene(camera(7)), keep=["signal"])
+    with pytest.raises(zonda.ZondaError, match=r"WhiteNoise.* makes what the kept signal"):
+        zonda.map(kept, [zonda.WhiteNoise(), *AGAIN])
     with pytest.raises(zonda.ZondaError, match="Path has no streams") as err:
         zonda.map(Path("night.h5"), AGAIN)
     assert "the step that reads recorded data" in str(err.value)

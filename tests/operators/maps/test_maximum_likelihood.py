@@ -285,12 +285,6 @@ def test_streams_that_a_filter_has_changed_are_refused():
     assert "MaximumLikelihoodMap" in str(caught.value)
 
 
-def test_baselines_too_long_for_a_scan_are_refused():
-    o = observation()
-    with pytest.raises(PipelineError, match="fewer than 10 baselines"):
-        mapped(o, np.zeros((o.n_detectors, o.n_samples)), baseline=f"{o.duration / 9} s")
-
-
 def test_a_window_is_refused():
     o, rng = observation(), np.random.default_rng(6)
     noise = SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
