@@ -90,14 +90,14 @@ class KeptSignals(Operator):
                 flags=scan.flags.copy(),
                 detector_flags=scan.detector_flags.copy(),
                 windows=dict(scan.windows),
-                detdata=KeptStreams(scan.detdata.parts),
+                detdata=KeptStreams(scan.detdata.every),
             )
             for scan, shared in zip(scans, common, strict=True)
         ]
 
     def prepare(self, observation: Observation) -> dict[str, tuple[Any, Any]]:
         """Take the streams of a scan, with their means."""
-        streams, observation.detdata = observation.detdata.parts, KeptStreams()
+        streams, observation.detdata = observation.detdata.every, KeptStreams()
         return streams
 
     def exec(self, block: Block, state: dict[str, tuple[Any, Any]]) -> None:

@@ -78,20 +78,28 @@ class WhiteLevel(Protocol):
 
 
 class KeptStreams(MutableMapping[str, AnyFloats]):
-    """Streams (n_det, n_samp) by name, whole, float64: each is made when it is asked for.
+    """Streams (n_det, n_samp) by name, whole, float64: each is made when it is asked for. An array
+    that a step puts in is that array.
 
     Attributes
     ----------
     parts
         By name: the stream as it was simulated, and the mean that must be added to it, or None.
+    given
+        Arrays that steps put in.
     """
 
     def __init__(self, parts: Mapping[str, tuple[AnyFloats, Any]] | None = None) -> None:
-        self.parts = dict(parts or {})
+        self.parts, self.given = dict(parts or {}), dict[str, AnyFloats]()
+
+    @property
+    def every(self) -> dict[str, tuple[AnyFloats, Any]]:
+        """``parts``, and what is ``given`` likewise."""
+        return {**self.parts, **{name: (array, None) for name, array in self.given.items()}}
 
     def rows(self, name: str, rows: slice) -> Floats:
         """Some detectors of a stream."""
-        array, mean = self.parts[name]
+        array, mean = self.every[name]
         found = np.array(array[rows], np.float64)
         if mean is not None:
             first, _, _ = rows.indices(len(array))
@@ -99,20 +107,25 @@ class KeptStreams(MutableMapping[str, AnyFloats]):
                 each += mean.evaluate(slice(k, k + 1), slice(0, each.size))[0]
         return found
 
-    def __getitem__(self, name: str) -> Floats:
-        return self.rows(name, slice(None))
+    def __getitem__(self, name: str) -> AnyFloats:
+        return self.given[name] if name in self.given else self.rows(name, slice(None))
 
     def __setitem__(self, name: str, stream: AnyFloats) -> None:
-        self.parts[name] = stream, None
+        self.parts.pop(name, None)
+        self.given[name] = stream
+
+    def setdefault(self, name: str, stream: Any = None) -> Any:
+        """The stream, or ``stream``, which is put in: the same for all threads."""
+        return self[name] if name in self.parts else self.given.setdefault(name, stream)
 
     def __delitem__(self, name: str) -> None:
-        del self.parts[name]
+        del (self.given if name in self.given else self.parts)[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.parts)
+        return iter(self.every)
 
     def __len__(self) -> int:
-        return len(self.parts)
+        return len(self.every)
 
     def __repr__(self) -> str:
         return f"<KeptStreams: {', '.join(self)}>"

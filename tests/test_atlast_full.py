@@ -82,6 +82,7 @@ def test_the_whole_of_it_fits_in_8_gb(tmp_path):
     assert found.bytes < left.memory
     assert any("made again" in what for what in found.elsewhere)
     with pytest.raises(
-        PipelineError, match=r"(?s)the run would hold .*BinMap .* GB.*budget is 1 GB.*larger pixel"
+        PipelineError,
+        match=r"(?s)the run would hold .*BinMap .* [GM]B.*budget is 1 GB.*larger pixel",
     ):
         divided(longest, Settings(threads=2, process=10**9))

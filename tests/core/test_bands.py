@@ -293,7 +293,7 @@ def written(net: str, passband: str) -> str:
             "300 uJy",
             "low: 100 GHz, high: 110 GHz",
             "t.yaml:13:53",
-            "bands.0.net: expected a noise level",
+            "bands.0.net: a noise level is in K",
         ),
         (
             "1 mK s(1/2)",

@@ -6,6 +6,7 @@ import numpy as np
 from astropy.coordinates import SkyCoord
 
 import zonda
+from zonda.core.observation import KeptStreams
 from zonda.plugins.checks.scenes import scan
 
 
@@ -42,3 +43,20 @@ def test_positions_of_detectors_are_those_that_a_map_counts() -> None:
     # a sample within rounding of an edge of a pixel may be counted on its other side
     assert np.abs(hits - product.hits).sum() <= 4
     assert product.hits.sum() == ra.size
+
+
+def test_an_array_that_a_step_keeps_is_that_array():
+    """Not a copy, which would lose what is written into it; also where several threads ask."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    kept = KeptStreams({"sky": (np.ones((2, 3), np.float32), None)})
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(lambda _: kept.setdefault("mine", np.zeros((2, 3))), range(200)))
+    assert all(array is made[0] for array in made)
+    kept["mine"][0] += 1
+    assert kept["mine"][0].tolist() == [1, 1, 1]
+    assert kept["sky"].dtype == np.float64
+    assert sorted(kept) == ["mine", "sky"]
+    assert len(kept) == 2
+    del kept["mine"]
+    assert "mine" not in kept

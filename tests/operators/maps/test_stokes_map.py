@@ -235,7 +235,7 @@ def warnings_of(*scans, **parameters):
         warnings.simplefilter("always")
         whole = Data(scene=scenes.scene(scans[0].instrument), observations=list(scans))
         BinMap(stokes="IQU", pixel="60 arcsec", **parameters).check(whole)
-    return [str(w.message) for w in caught]
+    return [str(w.message) for w in caught if "beam" not in str(w.message)]  # a wide pixel's
 
 
 def test_too_few_angles_are_told_beforehand():
