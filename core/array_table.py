@@ -90,7 +90,8 @@ NOT_READ: dict[str, tuple[tuple[str, ...], str]] = {
         ),
     ),
     **dict.fromkeys(
-        ("psi", "pol", "pol_x", "pol_y"), (ANGLE, "write polarization_angle, from eta towards xi")
+        ("psi", "pol", "pol_x", "pol_y"),
+        (ANGLE, "write polarization_angle, from eta towards xi"),
     ),
     **dict.fromkeys(("theta", "phi"), (PLACE, "write xi and eta")),
     "quat": (PLACE + ANGLE, "write xi, eta and polarization_angle"),

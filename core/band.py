@@ -242,7 +242,10 @@ class CameraBand(BandWithYield):
             except RegistryError as err:
                 passband = "a band of your own needs a passband: low and high, or file"
                 raise mistake(
-                    err.message, err.label, f"{passband}\n{err.cure}", at=("name",)
+                    err.message,
+                    err.label,
+                    f"{passband}\n{err.cure}",
+                    at=("name",),
                 ) from None
         return value
 

@@ -72,7 +72,10 @@ class Check:
                 found = self.measure()
         except RAISED as err:  # a check may fail in any way, the others go on
             return Result(
-                self, math.nan, time.perf_counter() - start, f"{type(err).__name__}: {err}"
+                self,
+                math.nan,
+                time.perf_counter() - start,
+                f"{type(err).__name__}: {err}",
             )
         figure, remark = found if isinstance(found, tuple) else (found, "")
         return Result(self, float(figure), time.perf_counter() - start, remark)

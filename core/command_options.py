@@ -92,7 +92,9 @@ class Bytes(_Integer):
             self.fail(f"{value!r} is not a size; write e.g. 4GB or 500MiB", param, ctx)
         if number == text and size < LEAST_BYTES:
             self.fail(
-                f"{value!r} has no unit and would be bytes; write e.g. 1GB or 500MiB", param, ctx
+                f"{value!r} has no unit and would be bytes; write e.g. 1GB or 500MiB",
+                param,
+                ctx,
             )
         if not 1 <= size < 2**63:
             self.fail(f"{value!r} is not a size a computer has", param, ctx)
@@ -129,7 +131,10 @@ set_option = click.option(
     help="Change one value, e.g. Step.parameter='0.5 Hz' or seed=8.",
 )
 keep_option = click.option(
-    "--keep", multiple=True, metavar="NAME", help="Simulate this effect or operator in full."
+    "--keep",
+    multiple=True,
+    metavar="NAME",
+    help="Simulate this effect or operator in full.",
 )
 drop_option = click.option(
     "--drop",
@@ -138,7 +143,10 @@ drop_option = click.option(
     help="Leave this effect or operator out, whatever that costs.",
 )
 only_option = click.option(
-    "--only", multiple=True, metavar="COMPONENT", help="Simulate this component (e.g. sky) alone."
+    "--only",
+    multiple=True,
+    metavar="COMPONENT",
+    help="Simulate this component (e.g. sky) alone.",
 )
 
 _ON_ENGINE = (

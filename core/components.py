@@ -135,7 +135,8 @@ class Registry:
             self._check(component, found)
         if not key:
             raise RegistryError(
-                f"this {self.kind} has no name", cure="give one: register(component, name='...')"
+                f"this {self.kind} has no name",
+                cure="give one: register(component, name='...')",
             )
         taken = self._index.get(key)
         if taken and taken[0].distribution != SESSION:
@@ -224,7 +225,8 @@ class Registry:
             made = component()
         except RAISED as err:
             if isinstance(err, ZondaError) and not isinstance(
-                err, ValueError
+                err,
+                ValueError,
             ):  # a ParameterError is the plugin's fault
                 raise
             raise _broken(self.kind, found, err) from err

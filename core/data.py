@@ -191,7 +191,9 @@ class Data:
                 if key in self.products:
                     cure = "rename the band, or give the step another product name"
                     raise PipelineError(
-                        f"two steps make the product {key!r}", place=f"band {band}", cure=cure
+                        f"two steps make the product {key!r}",
+                        place=f"band {band}",
+                        cure=cure,
                     )
                 self.products[key] = product
             self.partial |= {f"{label} {band}": part for label, part in own.partial.items()}
@@ -256,7 +258,9 @@ class Data:
         """
         if detectors < 1:
             raise PipelineError(
-                f"{detectors} detectors at a time", place="data.blocks", cure="take 1 or more"
+                f"{detectors} detectors at a time",
+                place="data.blocks",
+                cure="take 1 or more",
             )
         scans = self.observations if scan is None else [one_scan(self.observations, scan)]
         for observation in scans:
@@ -376,12 +380,15 @@ def kept(observation: Observation, stream: str, rows: slice = slice(None)) -> ND
             " sample of each stream"
         )
         raise InputError(
-            f"the stream {stream!r} was not kept, {what}", place=observation.name, cure=cure
+            f"the stream {stream!r} was not kept, {what}",
+            place=observation.name,
+            cure=cure,
         )
     found = observation.detdata.rows(stream, rows)
     if stream == EMISSION and EMISSION in observation.smooth:
         first, stop, _ = rows.indices(observation.n_detectors)
         found += observation.smooth[EMISSION].evaluate(
-            slice(first, stop), slice(0, observation.n_samples)
+            slice(first, stop),
+            slice(0, observation.n_samples),
         )
     return found

@@ -238,7 +238,9 @@ class Choice(TextValue):
         if found.size != 1:
             cure = "choose one that is one number, or name it in zonda accuracy --metric"
             raise PipelineError(
-                f"{self.name} is {found.size} numbers, not a figure", place=self.name, cure=cure
+                f"{self.name} is {found.size} numbers, not a figure",
+                place=self.name,
+                cure=cure,
             )
         says = (
             self.metric.function.__doc__

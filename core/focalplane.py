@@ -90,22 +90,27 @@ class Focalplane:
         if len(set(self.names)) != n:
             twice = sorted({d for d in self.names if self.names.count(d) > 1})
             raise InputError(
-                f"detector names must be unique; {twice[0]!r} is there twice", place="focal plane"
+                f"detector names must be unique; {twice[0]!r} is there twice",
+                place="focal plane",
             )
         for f in fields(self):
             value: Any = getattr(self, f.name)
             if len(value) != n:
                 raise InputError(
-                    f"{f.name} has {len(value)} entries for {n} detectors", place="focal plane"
+                    f"{f.name} has {len(value)} entries for {n} detectors",
+                    place="focal plane",
                 )
             if isinstance(value, np.ndarray):
                 setattr(
-                    self, f.name, np.asarray(value, np.int64 if f.name in WHOLE else np.float64)
+                    self,
+                    f.name,
+                    np.asarray(value, np.int64 if f.name in WHOLE else np.float64),
                 )
                 if not np.isfinite(value).all():
                     bad = self.names[int(np.flatnonzero(~np.isfinite(value))[0])]
                     raise InputError(
-                        f"{f.name} of detector {bad} is not finite", place="focal plane"
+                        f"{f.name} of detector {bad} is not finite",
+                        place="focal plane",
                     )
         outside = (self.polarization_efficiency < 0) | (self.polarization_efficiency > 1)
         if outside.any():

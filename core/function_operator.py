@@ -107,7 +107,9 @@ class FunctionOperator(Operator):
                 f" {type(err).__name__}{': ' * bool(words)}{words}"
             )
             raise PipelineError(
-                text, place=self.label, cure=f"mend it: {_where(err) or self.source}"
+                text,
+                place=self.label,
+                cure=f"mend it: {_where(err) or self.source}",
             ) from err
         self._idle = self._idle is not False and made is None and before == bits()
         if made is None:
@@ -121,7 +123,9 @@ class FunctionOperator(Operator):
                 number = len(self.provides) or "no"
                 wanted = f": it provides {number} streams; several stand in block.detdata"
             raise PipelineError(
-                f"the function returned {what}", place=self.label, cure=f"return nothing{wanted}"
+                f"the function returned {what}",
+                place=self.label,
+                cure=f"return nothing{wanted}",
             )
         block.new(name, zero=False)[...] = values
 
@@ -221,10 +225,14 @@ def operator(
         "__module__": __name__,
     }
     made = cast(Any, type(FunctionOperator))(
-        label if label.isidentifier() else "function", (FunctionOperator,), given
+        label if label.isidentifier() else "function",
+        (FunctionOperator,),
+        given,
     )
     step: FunctionOperator = made(
-        name=label, function=_named(function, own), source=_place(function)
+        name=label,
+        function=_named(function, own),
+        source=_place(function),
     )
     step._call = function
     return step

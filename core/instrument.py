@@ -210,7 +210,8 @@ class Instrument(ParametersWithYield):
             return value
         if (chosen := value.get("band")) is not None:
             whole = cls.model_validate(
-                {k: v for k, v in value.items() if k != "band"}, context=info.context
+                {k: v for k, v in value.items() if k != "band"},
+                context=info.context,
             )
             if not isinstance(chosen, str) or chosen not in whole.cameras:
                 text = "band beside bands is the name of one of them"
@@ -348,7 +349,9 @@ class Instrument(ParametersWithYield):
             label = nearest(name, [*LATTICES, "wafers", *layouts], err.label)
             cure = f"write hexagon, rings, wafers or a registered layout: {', '.join(layouts)}"
             raise mistake(
-                f"unknown layout {name!r}" if name not in layouts else err.message, label, cure
+                f"unknown layout {name!r}" if name not in layouts else err.message,
+                label,
+                cure,
             ) from None
         return layouts.registered(name)
 

@@ -82,7 +82,8 @@ def hexagon(n: int) -> tuple[Floats, Floats]:
     """
     x, y = _lattice(n)
     shell = np.max(
-        np.abs([x - y / math.sqrt(3), 2 * y / math.sqrt(3), x + y / math.sqrt(3)]), axis=0
+        np.abs([x - y / math.sqrt(3), 2 * y / math.sqrt(3), x + y / math.sqrt(3)]),
+        axis=0,
     )
     order = _order(n, x, y, shell)
     return x[order], y[order]
@@ -129,5 +130,6 @@ def _lattice(n: int) -> tuple[Floats, Floats]:
     reach = math.ceil(math.sqrt(n)) + 1
     i, j = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     return np.asarray((i + j / 2.0).ravel(), np.float64), np.asarray(
-        (j * math.sqrt(3) / 2).ravel(), np.float64
+        (j * math.sqrt(3) / 2).ravel(),
+        np.float64,
     )

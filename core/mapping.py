@@ -78,7 +78,9 @@ class KeptSignals(Operator):
         before = self._data.bands[data.band] if data.band else self._data
         if not data.band:
             data.log.state(
-                self.label, "signals", "kept by an earlier run, whose log has its counts"
+                self.label,
+                "signals",
+                "kept by an earlier run, whose log has its counts",
             )
         scans = before.observations if data.band or not before.pointed else before.pointed
         common = [scan.common for scan in data.observations] or [None] * len(scans)

@@ -451,7 +451,9 @@ class Observation:
             2 * np.pi
         )
         return np.where(
-            found < 2 * np.pi, found, 0.0
+            found < 2 * np.pi,
+            found,
+            0.0,
         )  # the remainder of what is a rounding below zero
 
     @property

@@ -338,7 +338,9 @@ class Pipeline:
             or available_memory() // 2,  # less, once the operators have said what they hold
             dtype=self._dtype,
             progress=lambda done, total, what: hooks.zonda_progress(
-                done=done, total=total, what=what
+                done=done,
+                total=total,
+                what=what,
             ),
             process=ceiling,
             asked=memory is not None,

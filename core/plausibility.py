@@ -50,7 +50,10 @@ def doubts(instrument: Instrument) -> list[str]:
     """The warnings about a telescope and its camera."""
     found = [
         doubt(
-            f"{instrument.telescope.name}: diameter", instrument.telescope.diameter, DIAMETER, "m"
+            f"{instrument.telescope.name}: diameter",
+            instrument.telescope.diameter,
+            DIAMETER,
+            "m",
         )
     ]
     for name, camera in instrument.cameras.items():

@@ -290,7 +290,11 @@ def draw_passband(ax: Any, band: Any) -> None:
     x = np.concatenate([[ghz[0] - spare, ghz[0]], ghz, [ghz[-1], ghz[-1] + spare]])
     ax.plot(x, np.pad(band.transmission, 2), color=SEQUENCE[0], linewidth=1.4)
     ax.axvline(
-        centre, color="black", linestyle=":", linewidth=1.0, label=f"centre {centre:.5g} GHz"
+        centre,
+        color="black",
+        linestyle=":",
+        linewidth=1.0,
+        label=f"centre {centre:.5g} GHz",
     )
     shade: dict[str, Any] = {"color": SEQUENCE[0], "alpha": 0.12, "linewidth": 0}
     ax.axvspan(centre - half, centre + half, ymax=0.8, label=f"width {2 * half:.4g} GHz", **shade)

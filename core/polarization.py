@@ -72,7 +72,10 @@ class PolarizationAngles(NamedTuple):
         if chi is not None:
             plate = np.stack([np.cos(4 * chi), np.sin(4 * chi)])
         return cls(
-            seen_from(boresight, pole), axes, plate, np.stack([np.cos(turn), -np.sin(turn)], axis=1)
+            seen_from(boresight, pole),
+            axes,
+            plate,
+            np.stack([np.cos(turn), -np.sin(turn)], axis=1),
         )
 
     @property

@@ -29,16 +29,23 @@ instruments = Registry("instrument", "zonda.instruments", "zonda.core.instrument
 sites = Registry("site", "zonda.sites", "zonda.core.site:Site")
 bands = Registry("band", "zonda.bands", "zonda.core.instrument:Band")
 layouts = Registry(
-    "layout", "zonda.layouts", classes=True
+    "layout",
+    "zonda.layouts",
+    classes=True,
 )  # functions of a number of pixels: core.layouts.Layout
 noise_models = Registry("noise model", "zonda.noise_models")
 spectra = Registry("spectra", "zonda.spectra")
 checks = Registry("checks", "zonda.checks", "zonda.core.checks:Family")
 metrics = Registry(
-    "metric", "zonda.metrics", classes=True
+    "metric",
+    "zonda.metrics",
+    classes=True,
 )  # classes, or functions of `Data`: core.accuracy.metrics
 weather_sources = Registry(
-    "weather source", "zonda.weather_sources", "zonda.core.weather:WeatherSource", classes=True
+    "weather source",
+    "zonda.weather_sources",
+    "zonda.core.weather:WeatherSource",
+    classes=True,
 )
 
 planning = Registry("planning", "zonda.planning", classes=True, exact=True)

@@ -207,7 +207,9 @@ def columns(array: AnyFloats, samples: slice) -> AnyFloats:
                 if not read:
                     cure = "do not change files in the temporary folder while zonda runs"
                     raise OutputError(
-                        "the temporary file was truncated", place=str(array.filename), cure=cure
+                        "the temporary file was truncated",
+                        place=str(array.filename),
+                        cure=cure,
                     )
                 place, left = place + read, left[read:]
     return found

@@ -96,7 +96,8 @@ def slow(n_samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     straight line.
     """
     weights = np.stack(
-        [30 + 0.1 * np.arange(N_DETECTORS), np.linspace(0.5, 1, N_DETECTORS)], axis=1
+        [30 + 0.1 * np.arange(N_DETECTORS), np.linspace(0.5, 1, N_DETECTORS)],
+        axis=1,
     )
     n = -(-n_samples // MEAN_STEP) + 3
     return weights, np.stack([np.ones(n + 24), -0.3 * np.arange(n + 24) / n])
@@ -327,7 +328,10 @@ def check_linear(operator: Operator) -> None:
 
     def act(signal: NDArray[np.float32], own: Any = None) -> NDArray[np.float64]:
         block = Block(
-            observation, slice(0, N_DETECTORS), slice(0, N_SAMPLES), {"signal": signal.copy()}
+            observation,
+            slice(0, N_DETECTORS),
+            slice(0, N_SAMPLES),
+            {"signal": signal.copy()},
         )
         if operator.couples == "all" and own is None:
             own = operator.measure(_stream(observation, signal, state, "signal/part"), model)
@@ -382,7 +386,11 @@ def check_products(operator: Operator) -> None:
         pipeline = Pipeline([Points(), Given(), operator])
         layouts = pipeline.point(made_up_scene(), {}, Path(folder)).layouts
         data = pipeline.run_part(
-            made_up_scene(), Part(layouts=layouts), threads=1, memory=1 << 30, output=folder
+            made_up_scene(),
+            Part(layouts=layouts),
+            threads=1,
+            memory=1 << 30,
+            output=folder,
         )
     for product in data.partial.values():
         kind = type(product)
@@ -470,7 +478,8 @@ def _small(operator: Operator) -> int:
     them, else short pieces.
     """
     least = {"time": 16 * N_SAMPLES, "detectors": N_DETECTORS * TILE_SAMPLES}.get(
-        operator.couples, 16 * TILE_SAMPLES
+        operator.couples,
+        16 * TILE_SAMPLES,
     )
     return 2 * 4 * least * (len(STREAMS) + 6)
 
@@ -500,7 +509,8 @@ def _unlike(a: Any, b: Any, name: str = "") -> str | None:
         if not isinstance(a, Mapping) or a.keys() != b.keys():
             return name or "what is made"
         return next(
-            (w for k in b if (w := _unlike(a[k], b[k], f"{name}.{k}" if name else str(k)))), None
+            (w for k in b if (w := _unlike(a[k], b[k], f"{name}.{k}" if name else str(k)))),
+            None,
         )
     if b is None or a is None:
         return None if a is b else name

@@ -26,7 +26,9 @@ def needed(module: str, extra: str, place: str = "") -> Any:
     except ImportError as err:
         cure = f"pip install 'zonda[{extra}]'"
         raise InputError(
-            f"cannot import {module}: {err}", place=place or f"zonda.interop.{extra}", cure=cure
+            f"cannot import {module}: {err}",
+            place=place or f"zonda.interop.{extra}",
+            cure=cure,
         ) from None
 
 

@@ -199,11 +199,13 @@ def resolve(value: Any) -> tuple[type[WeatherSource], dict[str, Any]]:
     named = [key for key in SHORTHAND if key in given]
     if "source" not in given and len(named) > 1:
         raise InputError(
-            f"{' and '.join(named)} are two sources of weather", cure=f"keep one; {example}"
+            f"{' and '.join(named)} are two sources of weather",
+            cure=f"keep one; {example}",
         )
     if isinstance(value, str) and (value[:1].isdigit() or value.strip().lower() == "random"):
         raise InputError(
-            f"'{value}' is no source of weather", cure=f"write weather: {{pwv: {value}}}; {example}"
+            f"'{value}' is no source of weather",
+            cure=f"write weather: {{pwv: {value}}}; {example}",
         )
     name = str(given.get("source") or (SHORTHAND[named[0]] if named else "climatology"))
     return weather_sources.get(name), {**given, "source": name}

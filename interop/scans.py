@@ -104,7 +104,8 @@ def _read(
             raise _absent(stream, opened.streams, str(path))
         every, whole = np.arange(tod.n_detectors), slice(0, tod.n_samples)
         values, _ = RecordedStream(opened, stream, every, np.uint8(0)).read(
-            slice(0, tod.n_detectors), whole
+            slice(0, tod.n_detectors),
+            whole,
         )
         flags = opened.flags(every, whole)
     finally:

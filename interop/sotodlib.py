@@ -102,16 +102,26 @@ def to_axismanager(
     )
     aman.wrap("timestamps", tod.times, [(0, "samps")])
     aman.wrap(
-        "signal", np.ascontiguousarray(tod.streams[stream], dtype), [(0, "dets"), (1, "samps")]
+        "signal",
+        np.ascontiguousarray(tod.streams[stream], dtype),
+        [(0, "dets"), (1, "samps")],
     )
     azimuth, elevation, roll = _angles(tod.boresight_azel)
     _wrap(
-        core, aman, "boresight", "samps", {"az": np.unwrap(-azimuth), "el": elevation, "roll": roll}
+        core,
+        aman,
+        "boresight",
+        "samps",
+        {"az": np.unwrap(-azimuth), "el": elevation, "roll": roll},
     )
     if len(tod.boresight_radec):
         ra, dec, psi = _angles(tod.boresight_radec)
         _wrap(
-            core, aman, "boresight_equ", "samps", {"ra": ra % (2 * np.pi), "dec": dec, "psi": psi}
+            core,
+            aman,
+            "boresight_equ",
+            "samps",
+            {"ra": ra % (2 * np.pi), "dec": dec, "psi": psi},
         )
     _wrap(
         core,
@@ -149,7 +159,9 @@ def sight_line(source: Source, *, scan: str | int | None = None, stream: str = "
     earth = orientation(np.array([middle]))
     longitude, latitude, turned = _moved_by_the_pole(tod.site, float(earth.x[0]), float(earth.y[0]))
     site = proj.EarthlySite(
-        float(np.degrees(longitude)), float(np.degrees(latitude)), float(tod.site[3])
+        float(np.degrees(longitude)),
+        float(np.degrees(latitude)),
+        float(tod.site[3]),
     )
     azimuth, elevation, roll = _angles(tod.boresight_azel)
     return proj.CelestialSightLine.az_el(
@@ -198,7 +210,9 @@ def _check_azel(tod: TimeOrderedData) -> None:
             "load the file with LoadTOD and save it again: azimuth and elevation are then computed"
         )
         raise InputError(
-            "has no azimuth and elevation (shared/boresight_azel)", place=tod.name, cure=cure
+            "has no azimuth and elevation (shared/boresight_azel)",
+            place=tod.name,
+            cure=cure,
         )
 
 
@@ -234,7 +248,8 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
     dead = (tod.detector_flags & np.uint8(DETECTOR_MASK)) != 0
     flags.wrap_dets("detectors", dead)
     flags.wrap_dets_samps(
-        "samples", so3g.RangesMatrix([so3g.Ranges.from_mask(row) for row in scan.spoilt])
+        "samples",
+        so3g.RangesMatrix([so3g.Ranges.from_mask(row) for row in scan.spoilt]),
     )
     excluded = (
         of_samples((tod.flags & np.uint8(SAMPLE_MASK)) != 0) + flags.detectors + flags.samples
@@ -276,7 +291,11 @@ def _det_info(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
     }.items():
         info.wrap(name, values, [(0, "dets")])
     _wrap(
-        core, info, "wafer", "dets", {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")}
+        core,
+        info,
+        "wafer",
+        "dets",
+        {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")},
     )
     return info
 

@@ -89,7 +89,9 @@ def from_toast(ob: Any, stream: str | None = "signal") -> TimeOrderedData:
     place = f"TOAST's observation {ob.name}"
     if ob.comm.group_size != 1:
         raise InputError(
-            "is spread over several processes", place=place, cure="use toast.Comm(groupsize=1)"
+            "is spread over several processes",
+            place=place,
+            cure="use toast.Comm(groupsize=1)",
         )
     if not hasattr(ob.telescope.site, "earthloc"):
         raise InputError(
@@ -142,7 +144,8 @@ class Simulate(toast.ops.Operator):  # type: ignore[misc, name-defined]
     """
 
     det_data = toast.traits.Unicode(
-        "signal", help="Observation detdata key for accumulating the simulated signal"
+        "signal",
+        help="Observation detdata key for accumulating the simulated signal",
     )
 
     def __init__(
@@ -157,7 +160,9 @@ class Simulate(toast.ops.Operator):  # type: ignore[misc, name-defined]
         if any("boresight" in operator.provides for operator in self._operators):
             cure = "leave it out: the observations are pointed already"
             raise PipelineError(
-                "an operator points the telescope", place="zonda.interop.toast.Simulate", cure=cure
+                "an operator points the telescope",
+                place="zonda.interop.toast.Simulate",
+                cure=cure,
             )
 
     def _exec(self, data: Any, detectors: Any = None, **kwargs: Any) -> None:

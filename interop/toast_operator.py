@@ -81,7 +81,10 @@ class ToastOperator(Operator):
             flags = np.zeros(0, np.uint8)
             self.prepare(
                 replace(
-                    scan, instrument=camera, focalplane=camera.focalplane(), detector_flags=flags
+                    scan,
+                    instrument=camera,
+                    focalplane=camera.focalplane(),
+                    detector_flags=flags,
                 )
             )
         return []
@@ -141,7 +144,9 @@ class ToastOperator(Operator):
         except Exception as err:  # of any kind, also mistakes of TOAST's own
             cure = "see the description of its traits in TOAST's documentation"
             raise PipelineError(
-                f"toast.ops.{self.operator}: {type(err).__name__}: {err}", place=place, cure=cure
+                f"toast.ops.{self.operator}: {type(err).__name__}: {err}",
+                place=place,
+                cure=cure,
             ) from err
         finally:
             there = list(data.obs)
@@ -256,7 +261,8 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
     which whole detectors, and which instants of all of them, are flagged."""
     observation = stream.observation
     own = np.array(
-        [ob.local_detector_flags[name] for name in ob.local_detectors], np.uint8
+        [ob.local_detector_flags[name] for name in ob.local_detectors],
+        np.uint8,
     ) & np.uint8(DETECTOR_MASK)
     used, good = observation.good_detectors, observation.good_samples
     new = (ob.detdata["flags"].data & ~before & np.uint8(DETECTOR_MASK)) != 0

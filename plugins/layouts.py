@@ -28,7 +28,8 @@ def turned(xi: Any, eta: Any, gamma: Any = 0.0) -> Rotation:
     xi, eta, gamma = np.broadcast_arrays(xi, eta, gamma)
     azimuth = np.arctan2(-xi, -eta)
     return Rotation.from_euler(
-        "ZYZ", np.stack([azimuth, np.arcsin(np.hypot(xi, eta)), gamma - azimuth], axis=-1)
+        "ZYZ",
+        np.stack([azimuth, np.arcsin(np.hypot(xi, eta)), gamma - azimuth], axis=-1),
     )
 
 
@@ -198,7 +199,9 @@ LAYOUTS: dict[str, Wafers] = {
     "so_sat": _sat(rhombi, HORNS),
     "cmb_s4_lat_lf": _s4(rhombi, 4 * 16.1, (62, 64, 67, 69, 75, 78, 80, 83)),
     "cmb_s4_lat_mf": _s4(
-        rhombi, HORNS, (*range(19, 61), 63, 70, 72, 73, 74, 77, 84, 85, 87, 88, 89, 90)
+        rhombi,
+        HORNS,
+        (*range(19, 61), 63, 70, 72, 73, 74, 77, 84, 85, 87, 88, 89, 90),
     ),
     "cmb_s4_lat_hf": _s4(hexagons, 12 * 5.2, range(19), -90.0),
     "prime_cam_module": replace(_lat(rhombi, HORNS, [MIDDLE]), margin=ARRAY * MODULES / (1.3 / 2)),

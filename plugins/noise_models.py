@@ -135,7 +135,10 @@ class BackgroundLimited(NoiseModel):
         )
         moments = _Moments.of(middle, width, square, rayleigh_jeans(middle, T_CMB)[None])
         return self._net(
-            moments, cmb_transmission, load, np.broadcast_to(polarization_efficiency, load.shape)
+            moments,
+            cmb_transmission,
+            load,
+            np.broadcast_to(polarization_efficiency, load.shape),
         )
 
     def _net(

@@ -379,7 +379,8 @@ class Bench:
     def mean_error(self, setting: Setting, reference: Setting) -> tuple[float, float]:
         """Change of the mean over seeds and its standard error (`Metric.mean_error`)."""
         return self.metric.mean_error(
-            self.measure(setting, True).found, self.measure(reference, True).found
+            self.measure(setting, True).found,
+            self.measure(reference, True).found,
         )
 
     def scatter(self, reference: Setting) -> float | None:

@@ -80,7 +80,8 @@ def fingerprint(file: PipelineFile) -> str:
         ],
     ]
     return hashlib.blake2b(
-        json.dumps(described, sort_keys=True).encode(), digest_size=8
+        json.dumps(described, sort_keys=True).encode(),
+        digest_size=8,
     ).hexdigest()
 
 

@@ -249,7 +249,9 @@ def get(name: str, parameters: Mapping[str, Any] | None = None) -> Metric:
     is_class = isinstance(found, type) and issubclass(found, Metric)
     if given and not (is_class and issubclass(found, Parameters)):
         raise InputError(
-            f"the metric {head} has no parameters", place="metric", cure=f"write {head} alone"
+            f"the metric {head} has no parameters",
+            place="metric",
+            cure=f"write {head} alone",
         )
     if is_class:
         return found(**given)  # type: ignore[no-any-return]

@@ -320,7 +320,9 @@ def least(points: Sequence[Point], target: float, left: float = 0.0) -> Point | 
     none.
     """
     return min(
-        (p for p in points if p.error + left <= target), key=lambda p: p.seconds, default=None
+        (p for p in points if p.error + left <= target),
+        key=lambda p: p.seconds,
+        default=None,
     )
 
 

@@ -132,7 +132,9 @@ def shortened(file: PipelineFile, duration: str | None, quick: bool) -> Setting:
             setting[f"{name}.scans"] = str(QUICK_SCANS)
     if not setting and duration:
         raise InputError(
-            "no pointing step has a scan_duration", place="--duration", cure="leave --duration out"
+            "no pointing step has a scan_duration",
+            place="--duration",
+            cure="leave --duration out",
         )
     return setting
 

@@ -25,7 +25,9 @@ def steps(operators: Any, name: str) -> list[Operator]:
     if isinstance(operators, Operator | str | Mapping) or not isinstance(operators, Iterable):
         cure = "write Pipeline([zonda.Name(...), ...]): a list of operators"
         raise PipelineError(
-            f"the steps are a list of operators, not {_what(operators)}", place=name, cure=cure
+            f"the steps are a list of operators, not {_what(operators)}",
+            place=name,
+            cure=cure,
         )
     made, wrong, cures = [], [], []
     for k, operator in enumerate(operators, 1):
@@ -46,7 +48,9 @@ def steps(operators: Any, name: str) -> list[Operator]:
             f"step {k}, {type(operator).__name__}: {fault}" for k, operator, (fault, _) in faults
         )
         raise PipelineError(
-            text, place=name, cure="\n".join(dict.fromkeys(cure for *_, (_, cure) in faults))
+            text,
+            place=name,
+            cure="\n".join(dict.fromkeys(cure for *_, (_, cure) in faults)),
         )
     return made
 
@@ -56,13 +60,17 @@ def runs(given: Any, name: str) -> dict[str, Signal]:
     cure = "write runs={'noiseless': {'only': ['sky']}, 'source_free': {'without': ['sky']}}"
     if given is not None and not isinstance(given, Mapping):
         raise PipelineError(
-            f"runs is a dict of signals by their names, not {_what(given)}", place=name, cure=cure
+            f"runs is a dict of signals by their names, not {_what(given)}",
+            place=name,
+            cure=cure,
         )
     made = {}
     for key, value in (given or {}).items():
         if not isinstance(value, Signal | Mapping):
             raise PipelineError(
-                f"signal {key} is a dict, not {_what(value)}", place=name, cure=cure
+                f"signal {key} is a dict, not {_what(value)}",
+                place=name,
+                cure=cure,
             )
         if isinstance(value, Signal) and key == needed_name(value):
             continue  # of `Pipeline.runs`: its output asks for it again
@@ -79,7 +87,9 @@ def components(only: Any, name: str) -> Sequence[str]:
     ):
         cure = f"write only=[{only!r}]" if isinstance(only, str) else "write only=['sky']"
         raise PipelineError(
-            f"only is a list of components, not {_what(only)}", place=name, cure=cure
+            f"only is a list of components, not {_what(only)}",
+            place=name,
+            cure=cure,
         )
     return only
 
@@ -89,7 +99,9 @@ def precision(given: Any, name: str) -> Any:
     if given not in PRECISIONS:
         cure = nearest(given, PRECISIONS) or f"write {' or '.join(map(repr, PRECISIONS))}"
         raise PipelineError(
-            f"precision is 'float32' or 'float64', not {given!r:.60}", place=name, cure=cure
+            f"precision is 'float32' or 'float64', not {given!r:.60}",
+            place=name,
+            cure=cure,
         )
     return given
 
@@ -110,7 +122,9 @@ def check_run(
             " file has one: file.scene()"
         )
         raise PipelineError(
-            f"a pipeline runs on a Scene, not on {_what(scene)}", place=name, cure=cure
+            f"a pipeline runs on a Scene, not on {_what(scene)}",
+            place=name,
+            cure=cure,
         )
     if output is not None and not isinstance(output, str | os.PathLike):
         raise PipelineError(

@@ -158,7 +158,9 @@ class Signals:
                     " subtract"
                 )
             raise PipelineError(
-                f"the stream {stream!r} cannot be kept: {what}", place=self._place, cure=cure
+                f"the stream {stream!r} cannot be kept: {what}",
+                place=self._place,
+                cure=cure,
             )
 
     # ---- what a signal is
@@ -196,7 +198,9 @@ class Signals:
                     or f"choose from: {', '.join(sorted(self.components))}"
                 )
                 raise PipelineError(
-                    f"{who} {what!r}, which no step provides", place=self._place, cure=cure
+                    f"{who} {what!r}, which no step provides",
+                    place=self._place,
+                    cure=cure,
                 )
 
     def _add_needed(self, given: Mapping[str, Signal]) -> None:

@@ -225,7 +225,13 @@ class Record:
         self._at_work.discard(task.number)
         attempts, error = self._attempts[task.number], _failure(task, self.folder).error
         self.done[task.number] = TaskRow(
-            task.number, "done", attempts, error, host, seconds, machine
+            task.number,
+            "done",
+            attempts,
+            error,
+            host,
+            seconds,
+            machine,
         )
 
     def failed(self, task: Task, host: str, seconds: float, error: str, again: bool) -> None:

@@ -110,7 +110,11 @@ def campaign(
         At the end where tasks have failed.
     """
     threads, memory, _ = arguments.check_run(
-        scene, output, {"threads": threads, "memory": memory, "ceiling": None}, (), PLACE
+        scene,
+        output,
+        {"threads": threads, "memory": memory, "ceiling": None},
+        (),
+        PLACE,
     )
     keys = _keys(pipeline)
     settings, folder = (
@@ -148,7 +152,9 @@ def _keys(pipeline: Any) -> list[str]:
             " zonda.load(file).pipeline()"
         )
         raise PipelineError(
-            f"a campaign is made of a Pipeline, not of {pipeline!r:.60}", place=PLACE, cure=cure
+            f"a campaign is made of a Pipeline, not of {pipeline!r:.60}",
+            place=PLACE,
+            cure=cure,
         )
     keys = []
     for operator in pipeline.operators:
@@ -166,7 +172,9 @@ def _keys(pipeline: Any) -> list[str]:
     if not any(map(may_write, pipeline.operators)):
         writers = ", ".join(operators_that(lambda step: issubclass(step, Output)))
         raise PipelineError(
-            "no step writes anything", place=PLACE, cure=f"add one that does: {writers}"
+            "no step writes anything",
+            place=PLACE,
+            cure=f"add one that does: {writers}",
         )
     return keys
 
@@ -236,7 +244,9 @@ def _source(
         ):
             cure = "use what files can say: registered names, numbers, text, files"
             raise PipelineError(
-                f"{label} cannot be written in a pipeline file", place=PLACE, cure=cure
+                f"{label} cannot be written in a pipeline file",
+                place=PLACE,
+                cure=cure,
             )
     return CampaignFile(variant)
 
@@ -273,7 +283,9 @@ def _plain(value: Any, place: str) -> Any:
         return str(value)
     cure = "give a number, text such as '0.3 deg/s', a quantity or a time"
     raise PipelineError(
-        f"{place}: {value!r:.60} cannot be written in a pipeline file", place=PLACE, cure=cure
+        f"{place}: {value!r:.60} cannot be written in a pipeline file",
+        place=PLACE,
+        cure=cure,
     )
 
 

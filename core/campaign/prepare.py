@@ -144,7 +144,10 @@ class _Draft:
                 if plan not in planned:  # those that differ in seed and night alone share a plan
                     planned[plan] = self._plan(source, entry, share)
                 entries[number] = PlannedEntry(
-                    planned[plan], entry.seed, entry.time.nanoseconds, about(entry)
+                    planned[plan],
+                    entry.seed,
+                    entry.time.nanoseconds,
+                    about(entry),
                 )
             own = {number + len(self.entries): entries[number] for number in members}
             self._combine(source, found[members[0]], own)
@@ -363,7 +366,8 @@ def _with_budget(file: PipelineFile, share: float) -> PipelineFile:
     budget = file.header.budget
     budget = budget * share if isinstance(budget, float | int) else budget
     return dataclasses.replace(
-        file, header=file.header.model_copy(update={"budget": budget, "campaign": None})
+        file,
+        header=file.header.model_copy(update={"budget": budget, "campaign": None}),
     )
 
 

@@ -288,7 +288,9 @@ def share(
         or job.version != __version__
     ):
         raise OutputError(
-            "holds another campaign", place=str(folder), cure="choose another output folder"
+            "holds another campaign",
+            place=str(folder),
+            cure="choose another output folder",
         )
     share_out(pool, job.need, job.name)
     mine = [task for task in job.tasks if task.number % which[1] == which[0] - 1]
@@ -343,7 +345,9 @@ def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> Ca
     _fail(result, len(job.tasks))
     if missing := len(job.tasks) - len(record.done):
         raise PipelineError(
-            f"{missing} tasks were not run", place=str(folder), cure=f"zonda resume {folder}"
+            f"{missing} tasks were not run",
+            place=str(folder),
+            cure=f"zonda resume {folder}",
         )
     if job.figures:
         with written.recording(folder, anew=False):

@@ -103,7 +103,9 @@ def mistakes(
         Lists the mistakes of a document without the campaign.
     """
     found = [_at_axis(mistake, document, value) for mistake in known] or _mistakes(
-        document, value, check
+        document,
+        value,
+        check,
     )
     if not found and value.figures and not _measures(document):
         steps = " or ".join(f"- {name}: {{metrics: [...]}}" for name in makers("figures"))
@@ -200,7 +202,10 @@ def _mistakes(
             elif key.split(".")[0] in REFUSED:
                 found.append(
                     Diagnostic(
-                        f"'{key}' cannot change from one entry to the next", span, "", REFUSED_WHY
+                        f"'{key}' cannot change from one entry to the next",
+                        span,
+                        "",
+                        REFUSED_WHY,
                     )
                 )
                 refused.add(key)
@@ -223,7 +228,8 @@ def _at_axis(mistake: Diagnostic, document: Document, campaign: Campaign) -> Dia
         if mistake.message == f"the pipeline needs '{key}'":
             here = document.sub(path).value
             first = setting(
-                key, here[0] if path[1] == "grid" and isinstance(here, list) else here
+                key,
+                here[0] if path[1] == "grid" and isinstance(here, list) else here,
             ).partition("=")[2]
             cure = (
                 f"write '{key}: {first}' at the top level too: the file is checked with it, and"

@@ -93,5 +93,7 @@ def _opened(path: Path, identity: str) -> Iterator[tuple[Any, dict[str, Any]]]:
     except Exception as err:  # a damaged archive fails in any way
         cure = "zonda resume looks for such files and makes them anew"
         raise InputError(
-            f"cannot be used: {str(err) or type(err).__name__}", place=str(path), cure=cure
+            f"cannot be used: {str(err) or type(err).__name__}",
+            place=str(path),
+            cure=cure,
         ) from None

@@ -49,7 +49,8 @@ def plugins(check: bool) -> None:
             click.echo(f"\n{failure}", err=True)
             if failure.__cause__ is not None:
                 click.echo(
-                    "".join(traceback.format_exception(failure.__cause__)).rstrip(), err=True
+                    "".join(traceback.format_exception(failure.__cause__)).rstrip(),
+                    err=True,
                 )
         click.echo(
             f"\n{len(rows)} components, {len(failures)} fault{'s' if len(failures) != 1 else ''}",

@@ -202,7 +202,8 @@ def _verify(
     wanted = f" (target {100 * target.target:g} %)" if target else ""
     each = f" (the largest of {by_band(bands)})" if bands else ""
     click.echo(
-        f"error of {metric} against the tightest knobs: {100 * error:.2g} %{each}{wanted}", err=True
+        f"error of {metric} against the tightest knobs: {100 * error:.2g} %{each}{wanted}",
+        err=True,
     )
 
 

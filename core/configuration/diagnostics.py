@@ -38,7 +38,8 @@ class TextValue:
         return core_schema.no_info_plain_validator_function(
             cls.parse,
             serialization=core_schema.plain_serializer_function_ser_schema(
-                cls.dump, when_used="json"
+                cls.dump,
+                when_used="json",
             ),
         )
 

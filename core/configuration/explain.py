@@ -161,7 +161,10 @@ class _Validated:
         inside = self.name(loc[:-1])
         message = f"unknown {'parameter' if self.python else 'key'} '{key}' for {inside}"
         return Diagnostic(
-            message, span, glued(key, options) or hint, f"{inside} takes: {', '.join(options)}"
+            message,
+            span,
+            glued(key, options) or hint,
+            f"{inside} takes: {', '.join(options)}",
         )
 
     def missing(self, name: str, loc: list[Any], span: Span) -> Diagnostic:
@@ -209,7 +212,8 @@ class _Validated:
         if kind == "literal_error":
             expected = context.get("expected", "")
             return f"must be {expected}, got {given}", nearest(
-                e["input"], re.findall(r"'([^']*)'", expected)
+                e["input"],
+                re.findall(r"'([^']*)'", expected),
             )
         if kind == "too_short":
             return (

@@ -79,11 +79,15 @@ def read(path: Path) -> str:
             content = file.read(MAXIMUM_BYTES + 1)
     except OSError as err:
         raise InputError(
-            f"cannot be read: {err.strerror}", place=str(path), cure="check its permissions"
+            f"cannot be read: {err.strerror}",
+            place=str(path),
+            cure="check its permissions",
         ) from None
     if len(content) > MAXIMUM_BYTES:
         raise InputError(
-            "is too large for a pipeline file", place=str(path), cure="give the path of a YAML file"
+            "is too large for a pipeline file",
+            place=str(path),
+            cure="give the path of a YAML file",
         )
     _check_kind(path, content)
     try:
@@ -93,7 +97,9 @@ def read(path: Path) -> str:
         column = err.start - (content.rfind(b"\n", 0, err.start) + 1) + 1
         message = f"is not UTF-8 text (byte 0x{content[err.start]:02x})"
         raise InputError(
-            message, place=f"{path}:{line}:{column}", cure="save it as UTF-8"
+            message,
+            place=f"{path}:{line}:{column}",
+            cure="save it as UTF-8",
         ) from None
 
 

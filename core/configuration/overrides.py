@@ -78,7 +78,9 @@ def _header_path(document: Document, parts: list[str]) -> Path:
         if isinstance(here, dict) and part not in here and (depth == 1 or LIKE in here):
             if within.isdecimal():
                 raise _Refused(
-                    f"the file has no '{where}'", "", f"set the whole list: {where}='[...]'"
+                    f"the file has no '{where}'",
+                    "",
+                    f"set the whole list: {where}='[...]'",
                 )
             here[part] = {}
             document.marks[tuple(path[:depth])] = document.mark(tuple(path[: depth - 1]))
@@ -91,7 +93,9 @@ def _header_path(document: Document, parts: list[str]) -> Path:
                     else f"set '{where}' itself"
                 )
                 raise _Refused(
-                    f"'{where}' is a list of {len(here)}: its entries are counted from 0", "", cure
+                    f"'{where}' is a list of {len(here)}: its entries are counted from 0",
+                    "",
+                    cure,
                 )
             path[depth] = int(within)
         elif not isinstance(here, dict):
@@ -132,7 +136,9 @@ def _step_path(document: Document, key: str, keys: list[str]) -> Path:
         raise _Refused(f"there are {len(same)} steps '{name}'", "", f"write {ways}")
     if number > len(same):
         raise _Refused(
-            f"there is no step '{name}.{number}'", "", f"write {name if len(same) == 1 else ways}"
+            f"there is no step '{name}.{number}'",
+            "",
+            f"write {name if len(same) == 1 else ways}",
         )
     if not all(parts) or not parts:
         raise _Refused(

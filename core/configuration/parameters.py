@@ -151,7 +151,9 @@ def without_a_type(
                 f" {name}(name={value!r:.40})"
             )
             return ZondaError(
-                f"{text}: the label of a step is no constant of its class", place=name, cure=cure
+                f"{text}: the label of a step is no constant of its class",
+                place=name,
+                cure=cure,
             )
         kind = type(value).__name__ if value is not None else "Any"
         if isinstance(value, FieldInfo):

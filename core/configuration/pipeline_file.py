@@ -149,7 +149,10 @@ class _Check(Mistakes):
             self.runs(header, steps)
         if header is not None and header.campaign is not None:
             self.found = section.mistakes(
-                self.document, header.campaign, self.found, self.without_campaign
+                self.document,
+                header.campaign,
+                self.found,
+                self.without_campaign,
             )
         if scene is not None and not self.found and self.target_of_map:
             scene = self.targeted(scene, [s.operator for s in steps if s is not None])
@@ -195,7 +198,8 @@ class _Check(Mistakes):
         ):  # the mistakes that are known come first
             warnings.simplefilter("ignore")
             for number, err in looks(
-                [None if step is None else step.operator for step in steps], scene
+                [None if step is None else step.operator for step in steps],
+                scene,
             )[1]:
                 step = steps[number]
                 if step is not None:
@@ -210,7 +214,10 @@ class _Check(Mistakes):
         if many:
             at = self.document.mark(("operators",)).start
             self.wrong(
-                f"a pipeline of {len(items or [])} steps", at, "", f"write at most {MOST_STEPS}"
+                f"a pipeline of {len(items or [])} steps",
+                at,
+                "",
+                f"write at most {MOST_STEPS}",
             )
         if isinstance(campaign, dict) and not many:
             many = section.too_large(campaign)  # the header's own check has said so
@@ -230,7 +237,10 @@ class _Check(Mistakes):
             have = " or ".join(registry.operators_that(lambda step: issubclass(step, WithMap)))
             cure = f"add {have}, or give a position" if have else "give a position"
             self.wrong(
-                "target: map takes the centre of an input map, and no step has one", at, "", cure
+                "target: map takes the centre of an input map, and no step has one",
+                at,
+                "",
+                cure,
             )
             return scene
         try:
@@ -303,14 +313,20 @@ class _Check(Mistakes):
         if isinstance(given.get("instrument"), dict):
             given["instrument"] = dict(given["instrument"])
             if not self.named(
-                given["instrument"], LIKE, registry.instruments, ("instrument", LIKE)
+                given["instrument"],
+                LIKE,
+                registry.instruments,
+                ("instrument", LIKE),
             ):
                 lost.add("instrument")
             own = LIKE in given["instrument"] or given["instrument"].get(
                 "bands"
             )  # which say more of an unknown band
             if not own and not self.named(
-                given["instrument"], "band", registry.bands, ("instrument", "band")
+                given["instrument"],
+                "band",
+                registry.bands,
+                ("instrument", "band"),
             ):
                 given["instrument"]["band"] = {
                     "name": "",
@@ -355,7 +371,8 @@ class _Check(Mistakes):
                 text = f"{step.label}: {key} is that of the recorded data, {above[key].name}"
                 use = "is not used" if key == "site" else "gives what they do not state"
                 warnings.warn(
-                    f"{text}; {getattr(scene, key).name} of this file {use}", stacklevel=2
+                    f"{text}; {getattr(scene, key).name} of this file {use}",
+                    stacklevel=2,
                 )
         return scene.model_copy(update=above)
 

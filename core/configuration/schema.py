@@ -63,7 +63,8 @@ def json_schema() -> dict[str, Any]:
     for definition in defs.values():
         if definition.get("title") == "Instrument":
             definition["properties"]["band"] = _name_or(
-                definition["properties"]["band"], registry.bands
+                definition["properties"]["band"],
+                registry.bands,
             )
             several = definition["properties"]["bands"]
             several["items"] = _name_or(several["items"], registry.bands)

@@ -172,7 +172,10 @@ def _step(mistakes: Mistakes, item: Any, at: Place) -> tuple[Step | None, Operat
                 else "a colon is missing"
             )
             mistakes.wrong(
-                f"cannot read the step '{name}'", span, missing, f"write '- {first}: {{...}}'"
+                f"cannot read the step '{name}'",
+                span,
+                missing,
+                f"write '- {first}: {{...}}'",
             )
         else:
             mistakes.refused(err, span)
@@ -184,7 +187,10 @@ def _step(mistakes: Mistakes, item: Any, at: Place) -> tuple[Step | None, Operat
             isinstance(parameters, str) and glued(parameters, known)
         ) or f"write '- {name}: {{...}}'"
         mistakes.wrong(
-            message, mistakes.document.mark(inner).value, label, f"{name} takes: {', '.join(known)}"
+            message,
+            mistakes.document.mark(inner).value,
+            label,
+            f"{name} takes: {', '.join(known)}",
         )
         return None, operator.model_construct()
     made = mistakes.validate(operator, parameters, inner, name)

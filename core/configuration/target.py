@@ -109,11 +109,15 @@ class Target(TextValue):
         if isinstance(value, list | tuple) and len(value) == 2:
             return cls._of("icrs", *value)
         if getattr(getattr(value, "frame", None), "name", "") == "altaz" and getattr(
-            value, "isscalar", False
+            value,
+            "isscalar",
+            False,
         ):
             return cls("horizontal", float(value.az.rad) % (2 * math.pi), float(value.alt.rad))
         if hasattr(getattr(value, "icrs", None), "ra") and getattr(
-            value, "isscalar", False
+            value,
+            "isscalar",
+            False,
         ):  # a SkyCoord
             return cls("icrs", float(value.icrs.ra.rad) % (2 * math.pi), float(value.icrs.dec.rad))
         raise mistake(f"expected a position such as '{_EXAMPLES[0]}', got {value!r}")
@@ -142,12 +146,14 @@ class Target(TextValue):
             word = equinox[0].strip()
             label = f"leave '{word}' out" + ("" if "2000" in word else "; precess it")
             raise mistake(
-                f"positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read", label
+                f"positions are ICRS (FK5 J2000 to 0.1 arcsec); '{word}' is not read",
+                label,
             )
         if match is None:
             cure = f"write two angles such as '{_EXAMPLES[0]}' (names of objects are not looked up)"
             raise mistake(
-                f"cannot read {text!r} as a position; {cure}", f"e.g. {' | '.join(_EXAMPLES)}"
+                f"cannot read {text!r} as a position; {cure}",
+                f"e.g. {' | '.join(_EXAMPLES)}",
             )
         keys = tuple((match[k] or "").lower() for k in ("key1", "key2"))
         named = match["frame"].lower() if match["frame"] else None

@@ -76,12 +76,14 @@ class Instant(TextValue):
         seconds = int(part["second"] or 0)
         if seconds == 60:
             raise mistake(
-                f"{text!r} is a leap second, which POSIX time cannot name", "add one second"
+                f"{text!r} is a leap second, which POSIX time cannot name",
+                "add one second",
             )
         fraction = part["fraction"] or ""
         if len(fraction.rstrip("0")) > 9:
             raise mistake(
-                f"{text!r} has more than nine decimals of a second", "times are exact to 1 ns"
+                f"{text!r} has more than nine decimals of a second",
+                "times are exact to 1 ns",
             )
         try:
             zone: timezone = UTC

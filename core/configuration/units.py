@@ -40,7 +40,10 @@ values, and of `Kind.most`, are still numbers."""
 
 KINDS = {
     "rad": Kind(
-        "an angle", ("4 arcmin", "11 arcsec", "0.5 deg"), ("deg", "arcmin", "arcsec", "rad"), 1e6
+        "an angle",
+        ("4 arcmin", "11 arcsec", "0.5 deg"),
+        ("deg", "arcmin", "arcsec", "rad"),
+        1e6,
     ),
     "rad / s": Kind(
         "an angular speed",
@@ -55,7 +58,10 @@ KINDS = {
         1e6,
     ),
     "rad / s3": Kind(
-        "an angular jerk", ("0.2 deg/s3",), ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3"), 1e6
+        "an angular jerk",
+        ("0.2 deg/s3",),
+        ("deg/s3", "arcmin/s3", "arcsec/s3", "rad/s3"),
+        1e6,
     ),
     "s": Kind("a time", ("20 min", "600 s"), ("s", "min", "h", "ms"), 1e15),
     "Hz": Kind("a frequency", ("0.1 Hz", "100 Hz"), ("Hz", "mHz", "GHz"), 1e18),
@@ -238,7 +244,9 @@ class Unit:
         write = (lambda v: v) if self.unit == "" else self.write
         written = core_schema.plain_serializer_function_ser_schema(write, when_used="json")
         return core_schema.no_info_before_validator_function(
-            self.parse, handler(source), serialization=written
+            self.parse,
+            handler(source),
+            serialization=written,
         )
 
     def __get_pydantic_json_schema__(

@@ -57,7 +57,11 @@ def causes(err: Any, text: str) -> list[Cause]:
         label = f"'{closing}' or a comma is missing behind it"
         return [
             Cause(
-                f"this '{bracket}' is not closed", start.line, start.column, start.column + 1, label
+                f"this '{bracket}' is not closed",
+                start.line,
+                start.column,
+                start.column + 1,
+                label,
             )
         ]
     line = min(mark.line if mark is not None else 0, len(rows) - 1)
@@ -79,7 +83,10 @@ def causes(err: Any, text: str) -> list[Cause]:
     if "expected ':'" in problem or "mapping values are not allowed" in problem:
         first = start.line if start is not None else None
         return list(_unread(rows, line if first is None else first)) or _otherwise(
-            rows, first, line, column
+            rows,
+            first,
+            line,
+            column,
         )
     if problem == "did not find expected '-' indicator" and column < len(rows[line]):
         end = len(rows[line].rstrip())
@@ -208,7 +215,11 @@ class Span:
         if self.line != self.end_line or first in ("'", '"'):
             return self
         return Span(
-            self.source, self.line, self.column + offset, self.line, self.column + offset + length
+            self.source,
+            self.line,
+            self.column + offset,
+            self.line,
+            self.column + offset + length,
         )
 
 
@@ -300,7 +311,9 @@ for _class in (_Loader, _Dumper):
         ("float", _FLOAT, "-+0123456789."),
     ]:
         _class.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), list(_first)
+            f"tag:yaml.org,2002:{_tag}",
+            re.compile(_pattern),
+            list(_first),
         )
 
 
@@ -372,7 +385,8 @@ class _TooLong(yaml.YAMLError):
 
 def _too_deep(mark: Any) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(
-        problem=f"nested deeper than {MAXIMUM_DEPTH} levels", problem_mark=mark
+        problem=f"nested deeper than {MAXIMUM_DEPTH} levels",
+        problem_mark=mark,
     )
 
 
@@ -454,7 +468,11 @@ class _Reader:
             for cause in found:
                 shift = self.column if cause.line == 0 else 0
                 span = Span(
-                    self.source, cause.line, cause.column + shift, cause.line, cause.end + shift
+                    self.source,
+                    cause.line,
+                    cause.column + shift,
+                    cause.line,
+                    cause.end + shift,
                 )
                 self.faults.append(Fault(cause.message, span, cause.label))
             if found:
@@ -494,7 +512,9 @@ class _Reader:
             tag = node.tag.replace("tag:yaml.org,2002:", "!!")
             self.faults.append(
                 Fault(
-                    f"the tag {tag:.60} is not known", span, "leave it away: nothing here needs one"
+                    f"the tag {tag:.60} is not known",
+                    span,
+                    "leave it away: nothing here needs one",
                 )
             )
             return None

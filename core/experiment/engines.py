@@ -323,21 +323,25 @@ def _dask(
                 " authority (ca_file)?"
             )
             if security is not None or not dask.config.get(
-                "distributed.client.security-loader", None
+                "distributed.client.security-loader",
+                None,
             ):
                 _check_certificates(security or distributed.Security(), address)
         client = distributed.Client(address, security=security, timeout=20, set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError) as err:
         why = str(err).splitlines()[0] if str(err) else type(err).__name__
         raise PipelineError(
-            f"cannot reach the Dask scheduler: {why}", place=scheduler, cure=cure
+            f"cannot reach the Dask scheduler: {why}",
+            place=scheduler,
+            cure=cure,
         ) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=600)
         except TimeoutError:
             raise PipelineError(
-                "the Dask scheduler has had no worker for ten minutes", place=scheduler
+                "the Dask scheduler has had no worker for ten minutes",
+                place=scheduler,
             ) from None
         workers = client.scheduler_info(n_workers=-1)["workers"].values()
         # a Dask worker does as many tasks at once as it has threads
@@ -394,7 +398,9 @@ def _check_certificates(security: Any, address: str) -> None:
         security.get_connection_args("client")
     except (OSError, ValueError) as err:
         raise PipelineError(
-            f"the certificates for TLS cannot be used: {err}", place=address, cure=cure
+            f"the certificates for TLS cannot be used: {err}",
+            place=address,
+            cure=cure,
         ) from None
 
 

@@ -56,7 +56,9 @@ class Image:
         """
         if self.polarization is None or self.axis is None:
             raise InputError(
-                "the image has no Q and U", place="image.stokes", cure="give a map of I, Q and U"
+                "the image has no Q and U",
+                place="image.stokes",
+                cure="give a map of I, Q and U",
             )
         if which not in ("I", "Q", "U"):
             raise InputError(
@@ -69,7 +71,8 @@ class Image:
             return plain
         to = wcs_frame_rotation(self.wcs)[2] if pole is None else pole
         return replace(
-            plain, values=_turned(self.polarization, (self.axis, to), self, "QU".index(which))
+            plain,
+            values=_turned(self.polarization, (self.axis, to), self, "QU".index(which)),
         )
 
     @property

@@ -325,7 +325,9 @@ class MapArrays:
 
         if self.header is None:
             raise InputError(
-                "a HEALPix map has no WCS", place="map", cure="use nside, pixels and healpy"
+                "a HEALPix map has no WCS",
+                place="map",
+                cure="use nside, pixels and healpy",
             )
         return WCS(self.header)
 

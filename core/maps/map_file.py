@@ -302,7 +302,9 @@ def write_map(product: MapArrays, path: str | Path, overwrite: bool) -> Path:
     path = Path(path).expanduser()
     if path.exists() and not overwrite:
         raise OutputError(
-            "exists already", place=str(path), cure="choose another name, or write overwrite=True"
+            "exists already",
+            place=str(path),
+            cure="choose another name, or write overwrite=True",
         )
     about: Provenance = product.origin or Provenance.of_a_map(product)
     noise: dict[str, tuple[float | None, str]] = {}

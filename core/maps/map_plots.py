@@ -195,7 +195,9 @@ def _label(ax: Any, shape: tuple[int, ...], stretched: float) -> None:
         values, spacing = axis.locator(*((-80.0, 80.0) if k else (0.0, 330.0)))
         middle = float(wcs.wcs.crval[0]) if k else 0.0
         for value, text in zip(
-            values.to_value("deg"), axis.formatter(values, spacing), strict=True
+            values.to_value("deg"),
+            axis.formatter(values, spacing),
+            strict=True,
         ):
             x, y = wcs.wcs_world2pix([(middle, value) if k else (value, middle)], 0)[0]
             ax.text(x, y, text, fontsize=8, ha="center", va="center", zorder=4, bbox=PALE)
@@ -209,7 +211,12 @@ def _label(ax: Any, shape: tuple[int, ...], stretched: float) -> None:
 
 
 def draw_map(
-    product: MapArrays, ax: Any, plane: str, title: str, limit: float | None, look: Look
+    product: MapArrays,
+    ax: Any,
+    plane: str,
+    title: str,
+    limit: float | None,
+    look: Look,
 ) -> Any:
     """`MapProduct.plot`."""
     look.check("map.plot")

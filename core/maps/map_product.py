@@ -186,7 +186,9 @@ class MapProduct(MapArrays):
                 " arcsec, which smoothing widens"
             )
             raise InputError(
-                message, place="map", cure="smooth it before: map.smooth(...).to('Jy/beam')"
+                message,
+                place="map",
+                cure="smooth it before: map.smooth(...).to('Jy/beam')",
             )
         if self.polarization is not None:
             return self._with_parts([one.smoothed(fwhm) for one in self.by_stokes().values()])

@@ -383,7 +383,8 @@ class HealpixTable(FileHeader):
         scheme = self.text("INDXSCHM").upper()
         if scheme not in ("", "IMPLICIT", "EXPLICIT"):
             raise self.error(
-                f"INDXSCHM = '{scheme}' is not known", "set it to IMPLICIT or EXPLICIT"
+                f"INDXSCHM = '{scheme}' is not known",
+                "set it to IMPLICIT or EXPLICIT",
             )
         if found is None and scheme == "EXPLICIT":
             raise self.error(

@@ -94,7 +94,9 @@ class ScanHits:
             if self.scans.count(scan) != 1:
                 text = f"{self.scans.count(scan)} scans of the map are called {scan!r}"
                 raise InputError(
-                    text, place="map.scan_hits", cure=f"give its number, 0 to {len(self.scans) - 1}"
+                    text,
+                    place="map.scan_hits",
+                    cure=f"give its number, 0 to {len(self.scans) - 1}",
                 )
             number = self.scans.index(scan)
         if not 0 <= int(number) < len(self.scans):
@@ -110,7 +112,8 @@ class ScanHits:
         scan.
         """
         number = np.repeat(
-            np.arange(len(self.scans), dtype=np.int32), [len(some) for some in self.pixels]
+            np.arange(len(self.scans), dtype=np.int32),
+            [len(some) for some in self.pixels],
         )
         none = np.zeros(0, np.int32)
         return {

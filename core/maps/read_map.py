@@ -80,7 +80,8 @@ def read_map(
         if is_healpix(found):
             if plane is not None:
                 raise reader.error(
-                    "plane is for images", "leave plane out: of a HEALPix table column is chosen"
+                    "plane is for images",
+                    "leave plane out: of a HEALPix table column is chosen",
                 )
             reader.read_table(coordsys, column)
         else:
@@ -317,5 +318,7 @@ def _scan_hits(table: Any, product: MapProduct) -> ScanHits:
     each = [number == k for k in range(len(product.scans))]
     hits = np.asarray(table["HITS"], np.int32)
     return ScanHits(
-        list(product.scans), [pixel[k].astype(np.int32) for k in each], [hits[k] for k in each]
+        list(product.scans),
+        [pixel[k].astype(np.int32) for k in each],
+        [hits[k] for k in each],
     )

@@ -149,7 +149,9 @@ def weighted_mean(convolve: Smoother, values: Floats, weights: Floats) -> tuple[
     total = convolve(weights)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(
-            known, convolve(weights * np.where(known, values, 0.0)) / total, np.nan
+            known,
+            convolve(weights * np.where(known, values, 0.0)) / total,
+            np.nan,
         ), total
 
 

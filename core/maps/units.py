@@ -64,7 +64,9 @@ def smoothing_width(given: Any, beam: float) -> float:
     if given is None:
         if not beam > 0:
             raise InputError(
-                "the beam of the map is not known", place="map", cure="write map.smooth('9 arcsec')"
+                "the beam of the map is not known",
+                place="map",
+                cure="write map.smooth('9 arcsec')",
             )
         return beam
     return angle_of(given, "map.smooth('9 arcsec')")
@@ -93,7 +95,8 @@ _SCALES = {
 }
 """Temperature scales without blanks and dashes; the main-beam temperature is that of a map."""
 _COMPTON = re.compile(
-    r"y|y[_ -]?sz|(y[_ -])?compton([_ -]?y)?|compton[_ -]?(y[_ -]?)?parameter", re.IGNORECASE
+    r"y|y[_ -]?sz|(y[_ -])?compton([_ -]?y)?|compton[_ -]?(y[_ -]?)?parameter",
+    re.IGNORECASE,
 )
 _KELVIN = re.compile(
     r"(?-i:([num]|))(?:K|Kelvins?)[\s_,]*\(?\s*"
@@ -117,7 +120,8 @@ _WORDS = {
 }
 """Names of units, whatever their case, as astropy has them."""
 _WORD = re.compile(
-    rf"(sq(?:uare)?[\s._]*)?(?-i:([numkM]?))({'|'.join(_WORDS)})(?![a-z])", re.IGNORECASE
+    rf"(sq(?:uare)?[\s._]*)?(?-i:([numkM]?))({'|'.join(_WORDS)})(?![a-z])",
+    re.IGNORECASE,
 )
 _BASES = {"Jy/pixel": "Jy / pix", "Jy/beam": "Jy / beam", "MJy/sr": "MJy / sr"}
 
@@ -161,7 +165,9 @@ def _scale(text: str, scale: str | None, place: str) -> str:
     known = _SCALES.get(re.sub(r"^k_?(?=rj|cmb)|[\s_-]", "", scale.strip().lower()))
     if known is None:
         raise InputError(
-            f"unknown temperature scale TEMPSCAL = '{scale}'", place=place, cure="use K_RJ or K_CMB"
+            f"unknown temperature scale TEMPSCAL = '{scale}'",
+            place=place,
+            cure="use K_RJ or K_CMB",
         )
     return known
 

@@ -75,7 +75,8 @@ def tracks(site: Site, times: Floats, *what: Target | str) -> list[Track]:
 
     with warnings.catch_warnings():
         warnings.simplefilter(
-            "ignore", erfa.ErfaWarning
+            "ignore",
+            erfa.ErfaWarning,
         )  # "dubious year": leap seconds to come are unknown
         jd, days = np.full(len(times), 2440587.5), times / DAY
         earth = orientation(jd - 2400000.5 + days)
@@ -99,7 +100,10 @@ def _track(one: Target | str, star: Any, when: Any, n: int) -> Track:
     )
     distance = np.ascontiguousarray(star["em"])
     seen = erfa.ab(
-        natural, np.ascontiguousarray(star["v"]), distance, np.ascontiguousarray(star["bm1"])
+        natural,
+        np.ascontiguousarray(star["v"]),
+        distance,
+        np.ascontiguousarray(star["bm1"]),
     )
     azimuth, zenith, *_ = erfa.atioq(
         *erfa.c2s(erfa.rxp(np.ascontiguousarray(star["bpn"]), seen)), star

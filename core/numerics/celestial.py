@@ -143,7 +143,8 @@ class CelestialTransform:
             now = self._interpolated(seconds[part])
             turn = conjugate(self._rotation(now, seconds[part]))
             out[part] = _natural(
-                rotate(turn, horizontal if horizontal.ndim == 1 else horizontal[part]), now
+                rotate(turn, horizontal if horizontal.ndim == 1 else horizontal[part]),
+                now,
             )
         return out
 
@@ -185,7 +186,8 @@ class CelestialTransform:
 
         with warnings.catch_warnings():
             warnings.simplefilter(
-                "ignore", erfa.ErfaWarning
+                "ignore",
+                erfa.ErfaWarning,
             )  # "dubious year": leap seconds to come are unknown
             utc1, utc2 = self._utc(seconds)
             earth = orientation(utc1 - 2400000.5 + utc2)
@@ -209,7 +211,9 @@ class CelestialTransform:
             )
         # columns of the rotation from CIRS to the horizon, from its three axes
         azimuth, zenith, *_ = erfa.atioq(
-            np.array([[0.0], [np.pi / 2], [0.0]]), np.array([[0.0], [0.0], [np.pi / 2]]), star
+            np.array([[0.0], [np.pi / 2], [0.0]]),
+            np.array([[0.0], [0.0], [np.pi / 2]]),
+            star,
         )
         sine = np.sin(zenith)
         axes = np.array(
@@ -284,7 +288,8 @@ class CelestialTransform:
     def _difference(exact: _Nodes, other: _Nodes) -> float:
         """Bound on the angle [rad] between directions transformed with the one and the other."""
         turn = 2 * np.linalg.norm(
-            multiply(exact.rotation, conjugate(other.rotation))[:, :3], axis=1
+            multiply(exact.rotation, conjugate(other.rotation))[:, :3],
+            axis=1,
         )
         velocity = np.linalg.norm(exact.velocity - other.velocity, axis=1)
         sun = 1e-5 * np.abs(exact.sun - other.sun).sum(
@@ -339,7 +344,8 @@ def _cubics(nodes: Floats) -> Floats:
     """
     a, b, c, d = (nodes[k : k + len(nodes) - 3] for k in range(4))
     return np.stack(
-        [b, c - a / 3 - b / 2 - d / 6, (a + c) / 2 - b, (d - a) / 6 + (b - c) / 2], axis=2
+        [b, c - a / 3 - b / 2 - d / 6, (a + c) / 2 - b, (d - a) / 6 + (b - c) / 2],
+        axis=2,
     )
 
 

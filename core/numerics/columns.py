@@ -144,7 +144,9 @@ def four_columns_at(
 
         def spread(value: Any) -> Any:
             return builder.shuffle_vector(
-                builder.insert_element(nothing, value, ir.Constant(integer, 0)), nothing, zeros
+                builder.insert_element(nothing, value, ir.Constant(integer, 0)),
+                nothing,
+                zeros,
             )
 
         four_bytes = builder.mul(stride, ir.Constant(stride.type, 4))
@@ -156,12 +158,22 @@ def four_columns_at(
             place = builder.add(place, four_bytes)
         first = make_array(signature.args[7])(context, builder, out).data
         builder.store(
-            total, builder.bitcast(builder.gep(first, [at]), many.as_pointer()), align=size
+            total,
+            builder.bitcast(builder.gep(first, [at]), many.as_pointer()),
+            align=size,
         )
         return context.get_dummy_value()
 
     return types.void(
-        types.uint64, types.uint64, v0, v1, v2, v3, fields, out, types.uint64
+        types.uint64,
+        types.uint64,
+        v0,
+        v1,
+        v2,
+        v3,
+        fields,
+        out,
+        types.uint64,
     ), generate
 
 
@@ -214,7 +226,9 @@ def _times(builder: Any, value: Any, size: int = 8) -> Any:
     nothing, lane = ir.Constant(ir.VectorType(value.type, size), ir.Undefined), ir.IntType(32)
     first = builder.insert_element(nothing, value, lane(0))
     return builder.shuffle_vector(
-        first, nothing, ir.Constant(ir.VectorType(lane, size), [0] * size)
+        first,
+        nothing,
+        ir.Constant(ir.VectorType(lane, size), [0] * size),
     )
 
 
@@ -224,7 +238,8 @@ def _together(builder: Any, values: Any) -> Any:
     found = ir.Constant(ir.VectorType(values[0].type, size), ir.Undefined)
     for value in {id(one): one for one in values}.values():
         places = ir.Constant(
-            ir.VectorType(lane, size), [k + size * (one is value) for k, one in enumerate(values)]
+            ir.VectorType(lane, size),
+            [k + size * (one is value) for k, one in enumerate(values)],
         )
         found = builder.shuffle_vector(found, _times(builder, value, size), places)
     return found
@@ -273,7 +288,8 @@ def running_terms(
         groups = [range(k, min(k + 8, lanes)) for k in range(0, lanes, 8)]
         totals = [
             cgutils.alloca_once_value(
-                builder, ir.Constant(ir.VectorType(integer, len(g)), [0] * len(g))
+                builder,
+                ir.Constant(ir.VectorType(integer, len(g)), [0] * len(g)),
             )
             for g in groups
         ]
@@ -293,7 +309,8 @@ def running_terms(
             ]
             factors += factors[-1:] * (lanes - len(factors))
             place = builder.mul(
-                builder.zext(builder.load(builder.gep(run, [loop.index])), integer), integer(lanes)
+                builder.zext(builder.load(builder.gep(run, [loop.index])), integer),
+                integer(lanes),
             )
             for group, total in zip(groups, totals, strict=True):
                 a, b, d = (
@@ -301,10 +318,12 @@ def running_terms(
                     for values in zip(*(factors[k] for k in group), strict=True)
                 )
                 term = builder.fadd(
-                    builder.fmul(builder.fmul(a, b), d), _times(builder, magic, len(group))
+                    builder.fmul(builder.fmul(a, b), d),
+                    _times(builder, magic, len(group)),
                 )
                 added = builder.add(
-                    builder.load(total), builder.bitcast(term, ir.VectorType(integer, len(group)))
+                    builder.load(total),
+                    builder.bitcast(term, ir.VectorType(integer, len(group))),
                 )
                 builder.store(added, total)
                 to = builder.gep(out, [builder.add(place, integer(group.start))])
@@ -363,5 +382,11 @@ def add_change(
         return context.get_dummy_value()
 
     return types.void(
-        f, types.uint64, sums, types.uint64, types.uint64, fields, types.int64
+        f,
+        types.uint64,
+        sums,
+        types.uint64,
+        types.uint64,
+        fields,
+        types.int64,
     ), generate

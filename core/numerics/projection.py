@@ -98,7 +98,9 @@ def frame_rotation(frame: str) -> Floats:
 
     if frame_transform_graph.lookup_name(frame) is None:
         raise InputError(
-            f"unknown celestial frame {frame!r}", place="frame", cure="use icrs or galactic"
+            f"unknown celestial frame {frame!r}",
+            place="frame",
+            cure="use icrs or galactic",
         )
     return _rotation_into(frame, frame, "frame")
 
@@ -111,7 +113,9 @@ def wcs_frame_rotation(wcs: WCS) -> Floats:
         frame = wcs_to_celestial_frame(wcs)
     except ValueError:
         raise InputError(
-            "the WCS has no celestial frame", place="WCS", cure="set CTYPE1, CTYPE2 and RADESYS"
+            "the WCS has no celestial frame",
+            place="WCS",
+            cure="set CTYPE1, CTYPE2 and RADESYS",
         ) from None
     if frame.name in ("icrs", "galactic"):
         return frame_rotation(frame.name)
@@ -131,7 +135,9 @@ def _rotation_into(frame: Any, called: str, place: str) -> Floats:
     matrix: Floats = np.array(axes.cartesian.xyz.value, dtype=np.float64)
     if not np.allclose(matrix @ matrix.T, np.eye(3), rtol=0, atol=1e-12):
         raise InputError(
-            f"{called} is not a rotation of ICRS", place=place, cure="use icrs or galactic"
+            f"{called} is not a rotation of ICRS",
+            place=place,
+            cure="use icrs or galactic",
         )
     return matrix
 

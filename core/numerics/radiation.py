@@ -188,7 +188,8 @@ def to_kelvin_rj(
     """
     if unit not in UNITS:
         raise InputError(
-            f"unknown unit '{unit}' of a sky map", cure=f"give one of {', '.join(UNITS)}"
+            f"unknown unit '{unit}' of a sky map",
+            cure=f"give one of {', '.join(UNITS)}",
         )
     if unit in SURFACE_BRIGHTNESS_UNITS:
         centre = band.centre

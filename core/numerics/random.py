@@ -173,7 +173,12 @@ def normal_tile(key, stream, number, words, bits, tile):  # type: ignore[no-unty
     """
     counter = uint64(number) << uint64(8)
     philox(
-        key, counter & uint64(0xFFFFFFFF), counter >> uint64(32), uint64(stream), uint64(0), words
+        key,
+        counter & uint64(0xFFFFFFFF),
+        counter >> uint64(32),
+        uint64(stream),
+        uint64(0),
+        words,
     )
     box_muller(words[0], words[1], bits, tile[0:256], tile[256:512])
     box_muller(words[2], words[3], bits, tile[512:768], tile[768:1024])

@@ -60,7 +60,9 @@ def interpolating(values: AnyFloats) -> NDArray[np.float64]:
     """
     out = np.empty(values.shape)
     rows = np.pad(
-        np.ascontiguousarray(values, np.float64), ((0, 0), (REACH, REACH)), mode="reflect"
+        np.ascontiguousarray(values, np.float64),
+        ((0, 0), (REACH, REACH)),
+        mode="reflect",
     )
     _prefilter(rows, _inverse_taps(REACH), out)
     return out
@@ -185,7 +187,10 @@ class SmoothField:
         parts = [part.refined(step) for part in (self, other)]
         weights = np.hstack([np.asarray(part.weights, np.float64) for part in parts])
         return SmoothField(
-            weights, np.vstack([part.coefficients for part in parts]), step, self.n_samples
+            weights,
+            np.vstack([part.coefficients for part in parts]),
+            step,
+            self.n_samples,
         )
 
     def refined(self, step: int) -> SmoothField:

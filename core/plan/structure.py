@@ -252,7 +252,9 @@ def chain_of(pipeline: Pipeline, structure: Structure) -> Chain:
     formed = [name for name in ["", *structure.runs] if name not in structure.derived]
     acting = [o for o in pipeline.operators if o.label in structure.operators]
     return Chain(
-        acting_steps(acting), tuple(signals.all[name] for name in formed), signals.components
+        acting_steps(acting),
+        tuple(signals.all[name] for name in formed),
+        signals.components,
     )
 
 

@@ -216,7 +216,10 @@ class BlockMaker:
         for signal in here:
             state = self._view.states[label]
             self._on_one(
-                step, block, signal, self._view.measured.get((label, signal.stream), state)
+                step,
+                block,
+                signal,
+                self._view.measured.get((label, signal.stream), state),
             )
         if len(here) > 1 and not step.linear:
             share_mask(block, [s.stream for s in here])
@@ -228,7 +231,9 @@ class BlockMaker:
             self._act(step, block, state)
             return
         seen = block.alone(
-            signal.stream, signal.components, self._chain.components - signal.components
+            signal.stream,
+            signal.components,
+            self._chain.components - signal.components,
         )
         self._act(step, seen, state)
         block.take(signal.stream, seen)
@@ -280,7 +285,12 @@ class BlockMaker:
             observation.log = Log()
         buffers = self._local.__dict__.setdefault("blocks", {}).setdefault(id(segment), {})
         block = Block(
-            observation, detectors, reach, dtype=self._dtype, buffers=buffers, again=again
+            observation,
+            detectors,
+            reach,
+            dtype=self._dtype,
+            buffers=buffers,
+            again=again,
         )
         rows = self._view.rows
         block.places = {name: array[rows][detectors, reach] for name, array in made.items()}

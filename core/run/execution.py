@@ -221,7 +221,8 @@ class Execution:
             return settings
         taken = resident_memory() - sum(array.nbytes for array in settings.spare)
         room = max(
-            settings.process - taken - memory_of(self.views, settings.threads, products=True), 1
+            settings.process - taken - memory_of(self.views, settings.threads, products=True),
+            1,
         )
         threads = settings.threads
         if room >= settings.memory:
@@ -449,10 +450,19 @@ class Execution:
             observation.detector_flags = observation.detector_flags.copy()
         if source.segment is not None:
             sweeper = partial(
-                self._make_again, views, source.segment, signal, f"{step.label} measures {name}"
+                self._make_again,
+                views,
+                source.segment,
+                signal,
+                f"{step.label} measures {name}",
             )
             stream: Stream = StreamMadeAgain(
-                name, observation, means, settings.threads, settings.dtype, sweeper
+                name,
+                observation,
+                means,
+                settings.threads,
+                settings.dtype,
+                sweeper,
             )
         else:
             room = max(settings.memory - self._store.held, 0)

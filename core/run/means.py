@@ -40,7 +40,8 @@ def knows_means(operator: Operator) -> bool:
     order = type(operator).__mro__
     says = next(n for n, c in enumerate(order) if "knows_means" in vars(c))
     does = next(
-        (n for n, c in enumerate(order) if {"exec", "measure"} & vars(c).keys()), len(order)
+        (n for n, c in enumerate(order) if {"exec", "measure"} & vars(c).keys()),
+        len(order),
     )
     return bool(operator.knows_means) and says <= does
 
@@ -125,7 +126,10 @@ def take_whole(
             mean = whole.buffer("(mean)", block.shape)
             fields[name].evaluate(block.detectors, block.samples, out=mean)
             np.subtract(
-                whole.detdata[name], mean, out=block.new(name, zero=False), casting="same_kind"
+                whole.detdata[name],
+                mean,
+                out=block.new(name, zero=False),
+                casting="same_kind",
             )
         else:
             block.new(name, zero=False)[...] = whole.detdata[name]

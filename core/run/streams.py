@@ -151,7 +151,9 @@ class Store:
             if self._folder is None:
                 self._folder = tempfile.TemporaryDirectory(prefix="zonda-")
             handle, path = tempfile.mkstemp(
-                ".stream", name.replace("/", "-"), self._folder.name
+                ".stream",
+                name.replace("/", "-"),
+                self._folder.name,
             )  # a new file: the old one may still be read
             try:
                 _reserve(handle, size)

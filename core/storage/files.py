@@ -392,7 +392,9 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
         above = next(parent for parent in folder.absolute().parents if parent.is_dir())
         cure = "choose another output folder"
         raise OutputError(
-            f"cannot be made: {above} takes no new folders", place=str(folder), cure=cure
+            f"cannot be made: {above} takes no new folders",
+            place=str(folder),
+            cure=cure,
         ) from error
     return folder
 

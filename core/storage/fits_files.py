@@ -173,7 +173,8 @@ def _next_header(file: IO[bytes], place: str) -> int | None:
                 size = each * (size + found.get(b"PCOUNT", 0))
                 if size < 0:  # astropy would go back in the file and never come to its end
                     raise _corrupt(
-                        "a header claims data of a negative length (NAXISn, PCOUNT, GCOUNT)", place
+                        "a header claims data of a negative length (NAXISn, PCOUNT, GCOUNT)",
+                        place,
                     )
                 return size if size < 2**62 else None
         if len(block) < BLOCK:

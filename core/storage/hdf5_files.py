@@ -192,5 +192,7 @@ def _refuse_other_files(file: Any, place: str) -> None:
 
 def _leaves(message: str, place: str) -> InputError:
     return InputError(
-        message, place=place, cure="give a file that holds everything itself, e.g. made by h5repack"
+        message,
+        place=place,
+        cure="give a file that holds everything itself, e.g. made by h5repack",
     )

@@ -320,7 +320,10 @@ def _number(text: str) -> float:
 
 
 def read_table(
-    path: Path, place: str = "", text: str | None = None, names: Sequence[str] | None = None
+    path: Path,
+    place: str = "",
+    text: str | None = None,
+    names: Sequence[str] | None = None,
 ) -> Table:
     """Read a table. The heading of text is the first line that is no comment; where that has
     numbers, a comment above with as many fields.

@@ -81,7 +81,9 @@ def air_correlation(x: Floats) -> Floats:
     x = np.asarray(x, np.float64)
     safe = np.maximum(x, 1e-30)
     return np.where(
-        x < 1e-12, 1.0, 2 ** (2 / 3) / math.gamma(1 / 3) * safe ** (1 / 3) * kv(1 / 3, safe)
+        x < 1e-12,
+        1.0,
+        2 ** (2 / 3) / math.gamma(1 / 3) * safe ** (1 / 3) * kv(1 / 3, safe),
     )
 
 

@@ -152,7 +152,8 @@ class OfDetectors:
             others = [one for held in bands if (one := held()) is not None]
             unlike = {one._alike for one in others if not one._looks_as(self)}
             self._alike = next(
-                (one._alike for one in others if one._alike not in unlike), len(bands)
+                (one._alike for one in others if one._alike not in unlike),
+                len(bands),
             )
             self._beside = bands
             bands.append(weakref.ref(self))
@@ -305,7 +306,8 @@ def keeps_all(n_detectors: int, n_samples: int, step: int, streams: int) -> bool
     """True if all units of `OfDetectors` are kept, so that blocks may be worked on in any order."""
     stream = 4 * n_detectors * n_samples
     return units_bytes(n_detectors, n_samples, step, streams) <= max(
-        BYTES_KEPT, min(ALL_KEPT, SHARE_KEPT * stream)
+        BYTES_KEPT,
+        min(ALL_KEPT, SHARE_KEPT * stream),
     )
 
 

@@ -268,7 +268,9 @@ class AtmosphereModel:
         if p.pwv_rms_after_beam:
             before, _ = Fluctuation(p.pwv_rms, True, self._variance_at_zenith).before_and_after()
         return Fluctuation(
-            before * float(self.slab.share(math.sin(self.elevation))), False, variance
+            before * float(self.slab.share(math.sin(self.elevation))),
+            False,
+            variance,
         )
 
     def strength(self, sine: Floats) -> Floats | None:
@@ -297,7 +299,10 @@ class AtmosphereModel:
         """The water between the lowest and the highest layer."""
         p = self.parameters
         return Slab(
-            self.profile if p.weights == "vapour" else None, p.lowest, p.highest, p.outer_scale
+            self.profile if p.weights == "vapour" else None,
+            p.lowest,
+            p.highest,
+            p.outer_scale,
         )
 
     @property
@@ -377,7 +382,13 @@ class AtmosphereModel:
             if not variance > 1e-12 * self.fluctuation.variance:
                 layers, variance = self.layers, self.fluctuation.variance
             found = choose_resolution(
-                self.observation, self.plane, layers, variance, tolerance, emission, rms
+                self.observation,
+                self.plane,
+                layers,
+                variance,
+                tolerance,
+                emission,
+                rms,
             )
             self._resolutions[tolerance] = found
         return self._resolutions[tolerance]
@@ -468,7 +479,11 @@ class Models:
         )
         if key not in self._bands:
             profile = profile_of(
-                self._weather, observation.site, time, observation.seed, parameters.pwv
+                self._weather,
+                observation.site,
+                time,
+                observation.seed,
+                parameters.pwv,
             )
             largest = largest_pwv(parameters.pwv or profile.pwv, parameters.pwv_rms)
             self._bands[key] = (

@@ -71,7 +71,9 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
             "layers evaluated at nodes of field and time",
         ),
         Knob(
-            "lattice", (0.6, 0.3, 0.15), "turbulence interpolated between the points of its lattice"
+            "lattice",
+            (0.6, 0.3, 0.15),
+            "turbulence interpolated between the points of its lattice",
         ),
         Knob(
             "fidelity",

@@ -41,7 +41,14 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     sines, terms = (path.low, path.high), model.terms((path.low, path.high))
     names = streams(parameters.outputs)
     response = Response(
-        model.band, model.pwv, law.limits(top), sines, vapour_height, per_vapour, names, terms
+        model.band,
+        model.pwv,
+        law.limits(top),
+        sines,
+        vapour_height,
+        per_vapour,
+        names,
+        terms,
     )
     if terms is not None:
         turbulence.weights = terms.weights
@@ -61,7 +68,9 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
         observation.log.state(label, what, text)
     if "path_delay" in parameters.outputs:
         observation.log.state(
-            label, "wet path delay", f"{per_vapour:.3f} times the PWV (non-dispersive)"
+            label,
+            "wet path delay",
+            f"{per_vapour:.3f} times the PWV (non-dispersive)",
         )
     arguments = chosen.nodes, turbulence, pwv, response, chosen.step, observation.n_samples
     if chosen.nodes.shape:

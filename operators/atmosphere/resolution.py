@@ -118,7 +118,8 @@ def choose_resolution(
     # What the mean emission may be wrong by, K_RJ (as if 0.01 % of the PWV fluctuated where none
     # does).
     allowed = max(
-        MEAN_SHARE * tolerance * float(emission(elevations[1])) * max(pwv_rms, 1e-4), 1e-9
+        MEAN_SHARE * tolerance * float(emission(elevations[1])) * max(pwv_rms, 1e-4),
+        1e-9,
     )
     mean_nodes = _mean_nodes(xi, eta, emission, elevations, allowed)
 
@@ -243,7 +244,10 @@ class _Timing:
                 return 0.0
             delta = self.path_errors(step)[0][k]
             return layer_time_error(
-                self._layers[k], self._speeds[k], delta, step / self._observation.sample_rate
+                self._layers[k],
+                self._speeds[k],
+                delta,
+                step / self._observation.sample_rate,
             )
 
         spent = error**2

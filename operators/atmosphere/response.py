@@ -288,7 +288,8 @@ class Response:
 def airmass(elevation: Floats, height: float) -> Floats:
     """Airmass of a spherical shell at ``height`` [m]: equation (1) of `radiative_transfer`."""
     return np.asarray(
-        1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2), np.float64
+        1 / np.sqrt(1 - (np.cos(elevation) / (1 + height / EARTH_RADIUS)) ** 2),
+        np.float64,
     )
 
 
@@ -301,7 +302,8 @@ def _ends(number: int) -> tuple[Floats, Floats]:
 def _to_series(n: int) -> Floats:
     """Matrix (n, n) from values at `chebyshev_points` to Chebyshev coefficients."""
     return np.asarray(
-        np.linalg.inv(np.polynomial.chebyshev.chebvander(chebyshev_points(n), n - 1)), np.float64
+        np.linalg.inv(np.polynomial.chebyshev.chebvander(chebyshev_points(n), n - 1)),
+        np.float64,
     )
 
 

@@ -273,7 +273,8 @@ def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: 
     samples = np.linspace(0, o.n_samples - 1, moments + 2)[1:-1].astype(np.int64) // step * step
     plane = o.focalplane
     radius = max(
-        float(np.hypot(plane.xi, plane.eta).max()), float(plane.fwhm.max()) / 2
+        float(np.hypot(plane.xi, plane.eta).max()),
+        float(plane.fwhm.max()) / 2,
     )  # of one detector its beam
     line = np.linspace(-1, 1, pixels) * radius
     xi, eta = (grid.ravel() for grid in np.meshgrid(line, line))
@@ -283,7 +284,13 @@ def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: 
     layers = _layers(model, at)
     cube = pwv.reshape(moments, pixels, pixels)
     return Screens(
-        layers, float(seconds[at]), seconds[samples], cube, 2 * radius, model.pwv, o.name
+        layers,
+        float(seconds[at]),
+        seconds[samples],
+        cube,
+        2 * radius,
+        model.pwv,
+        o.name,
     )
 
 
@@ -300,7 +307,9 @@ def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: NDArray[np.
         g, sine = layers(xi, eta, int(sample) // step, 1)
         strength = model.strength(sine)
         y = np.clip(
-            law(g if strength is None else g * strength), -1.0, model.band.pwv_max / model.pwv - 1
+            law(g if strength is None else g * strength),
+            -1.0,
+            model.band.pwv_max / model.pwv - 1,
         )
         found.append((model.pwv * y * airmass(np.arcsin(sine), height))[:, 0])
     return np.stack(found, axis=1)
@@ -326,7 +335,9 @@ def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
         here, track = place[-1], place[:-1] - place[-1]
         fwhm, d = field.sigma * FWHM_PER_SIGMA, field.spacing
         half = max(
-            LEAST_BEAMS / 2 * fwhm, layer.distance * angle, float(np.abs(track).max()) * 1.05
+            LEAST_BEAMS / 2 * fwhm,
+            layer.distance * angle,
+            float(np.abs(track).max()) * 1.05,
         )
         cells = min(MOST_CELLS // 2, math.ceil(half / d))
         i, j = (round(float(v) / d) for v in here)

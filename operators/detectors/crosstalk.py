@@ -135,7 +135,9 @@ def read_shares(path: Path, plane: Focalplane) -> Any:
     found = csr_array((share, (detector, source)), (len(plane), len(plane)))
     if found.nnz < len(share):
         raise InputError(
-            "a pair of detectors is there twice", place=table.place, cure="remove one of the rows"
+            "a pair of detectors is there twice",
+            place=table.place,
+            cure="remove one of the rows",
         )
     return found
 

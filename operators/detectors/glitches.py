@@ -100,7 +100,8 @@ class Glitches(Operator):
         number = int(mean + 6 * math.sqrt(mean) + 16)
         while True:
             u = uniforms(key, 0, 2 * number, stream=detector).reshape(
-                -1, 2
+                -1,
+                2,
             )  # pairs, so that more of them begin with the same
             when = np.cumsum(-np.log(u[:, 0])) / self.rate
             if when[-1] > span:

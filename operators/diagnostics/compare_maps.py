@@ -138,7 +138,8 @@ class CompareMaps(Output):
             name, found = maps[which]
             plane = self._with_noise(data, which, plane_of(found, name))
             plane = replace(
-                covered(plane, found, self.least_coverage), quiet=is_quiet(runs, self.map)
+                covered(plane, found, self.least_coverage),
+                quiet=is_quiet(runs, self.map),
             )
             reference = references[which]
             if self.file is None:

@@ -121,7 +121,9 @@ class CompareStreams(StreamDiagnostic):
                 state.found[detector] = pair(x, y, state.welch)
             else:
                 block.observation.log.count(
-                    self.label, "detectors left out for samples that are not finite", 1
+                    self.label,
+                    "detectors left out for samples that are not finite",
+                    1,
                 )
 
     def collect(self, data: Data, observation: Observation, state: Chosen) -> None:

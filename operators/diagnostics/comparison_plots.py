@@ -208,7 +208,9 @@ def draw_stream_comparison(found: StreamComparison, file: str, where: str) -> li
     coherence.set_ylim(0, 1.05)
     spectra.set_xlim(f[0], f[-1])
     for ax, up in zip(
-        axes, ("power spectral density [unit²/Hz]", "ratio", "coherence"), strict=True
+        axes,
+        ("power spectral density [unit²/Hz]", "ratio", "coherence"),
+        strict=True,
     ):
         finish(ax, "frequency [Hz]" if ax is coherence else "", up)
     spectra.legend(frameon=False, fontsize=9)

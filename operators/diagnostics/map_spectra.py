@@ -54,7 +54,8 @@ def on_the_plane(product: MapProduct, q_and_u: Floats) -> Floats:
     rays = np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(to_plane).T
     directions = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     return turned_by(
-        q_and_u, between_meridians(directions, frame_rotation(product.frame)[2], north)
+        q_and_u,
+        between_meridians(directions, frame_rotation(product.frame)[2], north),
     )
 
 
@@ -230,7 +231,9 @@ class MapSpectrum(Output):
         kinds = [made.get(name.rpartition("/")[2], "TAN") for name in self.maps]
         if len(kinds) > 1 and "HEALPix" in kinds:
             raise PipelineError(
-                SEVERAL_HEALPIX, place=self.label, cure="name one map in each MapSpectrum"
+                SEVERAL_HEALPIX,
+                place=self.label,
+                cure="name one map in each MapSpectrum",
             )
         if bad := [name for name, kind in zip(self.maps, kinds, strict=True) if kind not in USABLE]:
             raise PipelineError(f"there is no TAN map {bad[0]!r}", place=self.label, cure=CURE)

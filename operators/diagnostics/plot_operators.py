@@ -249,7 +249,8 @@ def draw_coverage(file: str, product: MapProduct) -> list[Sketch]:
     ax = plot_coverage(flat.hits, flat.wcs, per_beam=per_beam, title=title)
     samples, pixels = int(product.hits.sum()), int((product.hits > 0).sum())
     text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*product.sides)}.".replace(
-        ",", "\u202f"
+        ",",
+        "\u202f",
     )
     if per_beam is not None:
         beam = f"of {angle_text(product.fwhm)} FWHM (area π FWHM² / (4 ln 2))"
@@ -354,7 +355,8 @@ class Plots(MapOutput):
     provides: ClassVar[frozenset[str]] = frozenset({"pictures"})
 
     smooth: Annotated[Angle, Field(ge=0, le=0.1)] | Literal["beam", "none"] = Field(
-        "beam", examples=["9 arcsec"]
+        "beam",
+        examples=["9 arcsec"],
     )
     """Smooth image maps that are not smoothed yet for their pictures: with the beam, with a
     Gaussian of this FWHM, or not.
@@ -464,7 +466,8 @@ def _of_maps(data: Data, style: Plots) -> Iterator[Sketch]:
     shown = {
         name: maps[name]
         for name in sorted(
-            maps, key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n)
+            maps,
+            key=lambda n: (n.rpartition("/")[2], not n.startswith("noiseless/"), "/" in n),
         )
         if maps[name].contents == "all"
     }

@@ -159,7 +159,9 @@ class PowerSpectrum(StreamDiagnostic):
                     found[name] = power
                 else:
                     block.observation.log.count(
-                        self.label, f"detectors left out for non-finite samples of {name}", 1
+                        self.label,
+                        f"detectors left out for non-finite samples of {name}",
+                        1,
                     )
 
     def collect(self, data: Data, observation: Observation, state: Chosen) -> None:

@@ -74,7 +74,8 @@ class Report(Output):
             style = Plots().model_copy(update={"central_diameter": self.central_diameter})
             shown = list(pictures(data, style))
         data.products["report"] = write_text(
-            folder / "report.html", page(data, shown, self.central_diameter)
+            folder / "report.html",
+            page(data, shown, self.central_diameter),
         )
 
 

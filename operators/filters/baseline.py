@@ -84,7 +84,9 @@ class Basis:
         """
         normal, factor = self.normal(use), np.zeros((len(self.functions), self.size))
         if self.size < max(MANY, len(factor) + 1) or not _factor(
-            normal, DETERMINED * normal.diagonal().max(), factor
+            normal,
+            DETERMINED * normal.diagonal().max(),
+            factor,
         ):
             return _inverse(normal)
         return factor

@@ -121,7 +121,13 @@ def read_mean(stream: Stream, use: Mask, good: Mask, inside: Inside | None = Non
                 _look(tile, begin, end, use[detectors], sums[:, here], range_of[:, here], added)
                 continue
             _look(
-                tile, begin, end, np.zeros(rows, np.bool_), sums[:, here], range_of[:, here], added
+                tile,
+                begin,
+                end,
+                np.zeros(rows, np.bool_),
+                sums[:, here],
+                range_of[:, here],
+                added,
             )
             seen = use[detectors, None] & ~inside.at(detectors, at)
             for k in range(0, rows, TILE_DETECTORS):
@@ -305,7 +311,9 @@ class CommonModeFilter(LinearFilter):
             part.observation = copy.copy(whole)
             part.observation.name = f"{whole.name}, wafer {wafer}"
             part.observation.detector_flags = whole.detector_flags | np.where(
-                others, DEAD, 0
+                others,
+                DEAD,
+                0,
             ).astype(np.uint8)
             parts.append(self._modes(part, model.parts[k] if model else None))
             whole.detector_flags[~others] |= part.observation.detector_flags[~others]
@@ -418,7 +426,8 @@ class ModeSearch:
         wanted = min(step.modes, max(0, found.rank - 1))
         size = np.append(np.sqrt(np.maximum(found.values, 0.0)), 0.0)
         determined = max(
-            (i + 1 for i in range(wanted) if size[i + 1] <= step.gap * size[i]), default=0
+            (i + 1 for i in range(wanted) if size[i + 1] <= step.gap * size[i]),
+            default=0,
         )
         log.count(step.label, KEPT, step.modes - wanted)
         log.count(step.label, UNDETERMINED, wanted - determined)

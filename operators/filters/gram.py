@@ -71,7 +71,13 @@ class Ritz:
     def nothing(cls, n_det: int, n_samples: int, why: str = "no good detector") -> Ritz:
         """No mode at all."""
         return cls(
-            np.zeros(0), np.zeros((0, n_det)), np.zeros((0, n_samples)), np.zeros(0), 0, 0, why
+            np.zeros(0),
+            np.zeros((0, n_det)),
+            np.zeros((0, n_samples)),
+            np.zeros(0),
+            0,
+            0,
+            why,
         )
 
 
@@ -118,7 +124,12 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
                 rank += gram.left(seen @ space, _combined(seen, times)) > NOTHING * gram.energy
             leading = vectors[:, :k].T
             return Ritz(
-                values, np.array(leading @ space), _combined(leading, times), residuals[:k], rank, m
+                values,
+                np.array(leading @ space),
+                _combined(leading, times),
+                residuals[:k],
+                rank,
+                m,
             )
         if beta <= 1e-14 * gram.energy:  # an invariant subspace: go on in a new direction
             rest = gram.use * directions(m, gram.use.size)
@@ -242,7 +253,8 @@ class Gram(Usable):
         the detectors' rms about their means, where ``use`` is found."""
         self.good_samples = stream.observation.good_samples
         super().__init__(
-            stream.observation.good_detectors if use is None else use, int(self.good_samples.sum())
+            stream.observation.good_detectors if use is None else use,
+            int(self.good_samples.sum()),
         )
         self.stream, self.pool, self.n_samples = stream, pool, stream.shape[1]
         self.length = tile_length(stream.shape[0], stream.dtype.itemsize)

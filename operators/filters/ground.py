@@ -72,7 +72,8 @@ class GroundFilter(LinearFilter):
                 f" {np.degrees(self.bin):.3g} deg"
             )
             warnings.warn(
-                f"{self.label}: {text}: the template is a mean; choose a smaller bin", stacklevel=2
+                f"{self.label}: {text}: the template is a mean; choose a smaller bin",
+                stacklevel=2,
             )
         observation.log.state(self.label, f"{observation.name}: bins of the template", f"{size}")
         trend = polynomials(observation.n_samples, self.trend).functions[1:]

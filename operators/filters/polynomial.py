@@ -93,7 +93,9 @@ class Despline(LinearFilter):
         self._inside(observation)
         basis = splines(observation.n_samples, self.knots * observation.sample_rate)
         observation.log.state(
-            self.label, f"{observation.name}: functions fitted to each detector", f"{basis.size}"
+            self.label,
+            f"{observation.name}: functions fitted to each detector",
+            f"{basis.size}",
         )
         return Fit.of(basis, has_a_signal(observation.flags)), None
 
@@ -127,10 +129,15 @@ class PolynomialFilter(LinearFilter):
         pieces = Pieces.of(parts, self.order, has_a_signal(observation.flags))
         observation.flags[pieces.outside] |= TRIMMED
         observation.log.count(
-            self.label, "samples between intervals, flagged", int(pieces.outside.sum()), n
+            self.label,
+            "samples between intervals, flagged",
+            int(pieces.outside.sum()),
+            n,
         )
         observation.log.state(
-            self.label, f"{observation.name}: polynomials of order {self.order}", f"{len(parts)}"
+            self.label,
+            f"{observation.name}: polynomials of order {self.order}",
+            f"{len(parts)}",
         )
         return pieces, self._inside(observation)
 
@@ -191,7 +198,8 @@ class Pieces:
         spoilt, removed = 0, list[Floats]()
         for part, fit in zip(self.parts, self.fits, strict=True):
             found, bad = fit.coefficients(
-                rows.at(part.start), None if masked is None else masked[:, part]
+                rows.at(part.start),
+                None if masked is None else masked[:, part],
             )
             fit.basis.subtract(rows.at(part.start), found)
             removed.extend(product(found, fit.basis.functions[:, [0, -1]]).T)

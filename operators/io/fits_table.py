@@ -146,7 +146,8 @@ def _tables(tod: TimeOrderedData) -> Iterator[Any]:
     """Tables beside that of the streams."""
     known = tod.of_samples()
     samples = _table(
-        "SAMPLES", [(name, form, unit, known[k]) for name, form, unit, k in SAMPLES if k in known]
+        "SAMPLES",
+        [(name, form, unit, known[k]) for name, form, unit, k in SAMPLES if k in known],
     )
     samples.header["FLAGBITS"] = ("TOAST", "bits of FLAGS")
     for key, name, unit, meaning in _WEATHER if tod.weather is not None else ():
@@ -206,7 +207,9 @@ class Reader:
             self._row = int(table.header["NAXIS1"])
             if int(table.header["NAXIS2"]) != self.tod.n_detectors:
                 raise InputError(
-                    "TOD and DETECTORS have other numbers of rows", place=self.place, cure=CURE
+                    "TOD and DETECTORS have other numbers of rows",
+                    place=self.place,
+                    cure=CURE,
                 )
             self.tod.check(self.place)
             self.streams: dict[str, str] = {}
@@ -249,7 +252,9 @@ class Reader:
         """The file has no noise models. Raises InputError where one is asked for."""
         if model is not None:
             raise InputError(
-                "is FITS, which has no noise models", place=self.place, cure="leave noise_model out"
+                "is FITS, which has no noise models",
+                place=self.place,
+                cure="leave noise_model out",
             )
         return {}
 

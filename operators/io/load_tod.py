@@ -117,7 +117,9 @@ class LoadTOD(RecordedFiles):
             block.means[RECORDED] = state.mean
         spoilt = state.add(block.detectors, block.samples, out)
         block.observation.log.count(
-            self.label, "samples of single detectors that the file flags", spoilt
+            self.label,
+            "samples of single detectors that the file flags",
+            spoilt,
         )
 
     def collect(self, data: Data, observation: Observation, state: RecordedStream | None) -> None:
@@ -147,7 +149,9 @@ class _Scans:
                 " point the telescope"
             )
             raise InputError(
-                "stands behind a step that has made scans", place=step.label, cure=cure
+                "stands behind a step that has made scans",
+                place=step.label,
+                cure=cure,
             )
         own = step.own_scene(given.instrument)
         if abs(given.time.seconds_since(own["time"])) > MOMENT:
@@ -211,14 +215,18 @@ class _Scans:
                 )
                 cure = "load the files of one instrument, all bands of each scan; or choose a band"
                 raise InputError(
-                    f"was recorded with {what}, the first scan with {first}", place=place, cure=cure
+                    f"was recorded with {what}, the first scan with {first}",
+                    place=place,
+                    cure=cure,
                 )
         if len(scan) > most:
             text = (
                 f"has the bands {', '.join(bands)}, the first scan {', '.join(instrument.cameras)}"
             )
             raise InputError(
-                text, place=place, cure="begin with a scan of all bands; or choose a band"
+                text,
+                place=place,
+                cure="begin with a scan of all bands; or choose a band",
             )
         for part in (band for band in scan if band.path != scan[0].path):
             _check_same_scan(scan[0], part, f"{self.step.label}, {part.path.name}")
@@ -237,17 +245,25 @@ class _Scans:
                 cure="leave out the samples that repeat",
             )
         fwhm = tod.columns.get(
-            "fwhm", plane.fwhm
+            "fwhm",
+            plane.fwhm,
         )  # of all bands of the file, whichever are used; these alone have been checked
         tolerance = self.step.interpolation_error * float(fwhm[fwhm > 0].min())
         azel, radec, source = boresights(
-            tod, start, scene.site, self.step.celestial, tolerance, place
+            tod,
+            start,
+            scene.site,
+            self.step.celestial,
+            tolerance,
+            place,
         )
         sample_flags = tod.sample_flags(self.step.flag_mask)
         good = flags.good(sample_flags, flags.EXCLUDE_SAMPLE)
         flagged = np.concatenate([b.tod.detector_flags[b.rows] for b in bands])
         dead = np.where(
-            flagged & np.uint8(self.step.detector_mask), np.uint8(flags.INVALID), np.uint8(0)
+            flagged & np.uint8(self.step.detector_mask),
+            np.uint8(flags.INVALID),
+            np.uint8(0),
         )
         observation = Observation(
             name=self._unique(tod.name, bands),
@@ -372,10 +388,16 @@ def _tell(label: str, observation: Observation, file: File) -> None:
     good, dead = flags.good(file.flags, flags.EXCLUDE_SAMPLE), observation.detector_flags != 0
     observation.log.state(label, "noise of the detectors", file.noise)
     observation.log.count(
-        label, "samples that the file's flags exclude", int((~good).sum()), good.size
+        label,
+        "samples that the file's flags exclude",
+        int((~good).sum()),
+        good.size,
     )
     observation.log.count(
-        label, "detectors that the file's flags exclude", int(np.count_nonzero(dead)), len(dead)
+        label,
+        "detectors that the file's flags exclude",
+        int(np.count_nonzero(dead)),
+        len(dead),
     )
 
 

@@ -134,12 +134,16 @@ def noise_of(
         if signal not in file.streams:
             have = ", ".join(sorted(file.streams)) or "none"
             raise InputError(
-                f"has no stream {signal!r}", place=place, cure=f"choose --signal from: {have}"
+                f"has no stream {signal!r}",
+                place=place,
+                cure=f"choose --signal from: {have}",
             )
         usable = (tod.detector_flags & np.uint8(flags.DETECTOR_MASK)) == 0
         if not usable.any():
             raise InputError(
-                "all detectors are flagged", place=place, cure="unflag those that can be used"
+                "all detectors are flagged",
+                place=place,
+                cure="unflag those that can be used",
             )
         good = (tod.flags & np.uint8(flags.SAMPLE_MASK)) == 0
         found = {}
@@ -154,7 +158,9 @@ def noise_of(
                 values, _ = stream.read(rows, slice(0, tod.n_samples))
                 for number, row in enumerate(values, rows.start):
                     found[tod.names[use[number]]] = estimate(
-                        row if mean is None else (row - mean) * back, good, tod.sample_rate
+                        row if mean is None else (row - mean) * back,
+                        good,
+                        tod.sample_rate,
                     )
     finally:
         file.close()

@@ -237,7 +237,8 @@ class RecordedFiles(Operator):
         """
         first = observation.focalplane.names[0]
         return next(
-            (file for file in self._scans.get(observation.index, ()) if first in file.rows), None
+            (file for file in self._scans.get(observation.index, ()) if first in file.rows),
+            None,
         )
 
     def scans(self, given: Instrument | None) -> Iterator[Scan]:
@@ -319,7 +320,9 @@ def _stamp(path: Path) -> tuple[int, int]:
         stat = os.stat(path)
     except OSError as err:
         raise InputError(
-            f"cannot be read: {err.strerror}", place=str(path), cure="was it moved or removed?"
+            f"cannot be read: {err.strerror}",
+            place=str(path),
+            cure="was it moved or removed?",
         ) from None
     return stat.st_size, stat.st_mtime_ns
 

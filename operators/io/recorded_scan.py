@@ -147,7 +147,9 @@ def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[
     near = [rows for rows, c in zip(every, centres, strict=True) if is_near(c, band)]
     if len(near) != 1:
         raise InputError(
-            f"has no band, or more than one, at {band / 1e9:g} GHz", place=place, cure=cure
+            f"has no band, or more than one, at {band / 1e9:g} GHz",
+            place=place,
+            cure=cure,
         )
     return near
 
@@ -191,7 +193,9 @@ def joined(cameras: Sequence[RecordedInstrument], place: str) -> RecordedInstrum
         made.focalplane()
     except InputError as err:
         raise InputError(
-            err.message, place=place, cure="give every detector a name of its own"
+            err.message,
+            place=place,
+            cure="give every detector a name of its own",
         ) from None
     return made
 
@@ -294,7 +298,9 @@ def _band(
             text = f"has detectors at {stated / 1e9:.4g} GHz, the instrument at"
             cure = "give the scene an instrument with that band"
             raise InputError(
-                f"{text} {given.band.centre / 1e9:.4g} GHz alone", place=place, cure=cure
+                f"{text} {given.band.centre / 1e9:.4g} GHz alone",
+                place=place,
+                cure=cure,
             )
         return given.band
     centre, width = (float(np.median(columns[name])) for name in ("band_centre", "band_width"))
@@ -350,7 +356,9 @@ def _focalplane(
                 " be used"
             )
             raise InputError(
-                f"{name} of detector {names[bad[0]]} is {values[bad[0]]:g}", place=place, cure=cure
+                f"{name} of detector {names[bad[0]]} is {values[bad[0]]:g}",
+                place=place,
+                cure=cure,
             )
     found["minimum_frequency"] = np.maximum(found["minimum_frequency"], 1e-9)
     return Focalplane(names=names, **found)

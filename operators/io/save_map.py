@@ -74,7 +74,9 @@ class SaveMap(MapOutput):
         planes, runs = maps_of(data.products), data.provenance.get("runs")
         files = {
             product_path(folder, name, ".fits"): MapFile.of(
-                name, self.in_unit(product), noise_stated(planes, name, runs)
+                name,
+                self.in_unit(product),
+                noise_stated(planes, name, runs),
             )
             for name, product in maps.items()
         }
@@ -87,7 +89,10 @@ class SaveMap(MapOutput):
                 }
                 cards = noise_cards([f for f in figures if f.product == name])
                 files[product_path(folder, f"noise_{name}", ".fits")] = MapFile(
-                    f"noise_{name}", self.in_unit(product), alone, cards
+                    f"noise_{name}",
+                    self.in_unit(product),
+                    alone,
+                    cards,
                 )
         if not self.overwrite:
             for path in files:

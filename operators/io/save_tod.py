@@ -126,11 +126,15 @@ class SaveTOD(StreamOutput):
         tod.weather = observation.weather or _weather(data, observation, self.label)
         if self.dtype == "float32":
             observation.log.state(
-                self.label, "largest rounding to float32 [K]", f"{state.largest * 2.0**-24:.1e}"
+                self.label,
+                "largest rounding to float32 [K]",
+                f"{state.largest * 2.0**-24:.1e}",
             )
         if "white" not in observation.components:
             observation.log.state(
-                self.label, "NET of the detectors", "the instrument's; this run has no white noise"
+                self.label,
+                "NET of the detectors",
+                "the instrument's; this run has no white noise",
             )
         tod.take_flags(observation)
         log = "\n".join(f"{who}: {what}: {value}" for who, what, value in observation.log)
@@ -214,7 +218,10 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
     types = {s.dtype.name for s in tod.streams.values()}
     with atomic_path(path) as temporary:
         writer = module.Writer(
-            temporary, tod, list(tod.streams), "float64" if types != {"float32"} else "float32"
+            temporary,
+            tod,
+            list(tod.streams),
+            "float64" if types != {"float32"} else "float32",
         )
         try:
             for name, values in tod.streams.items():

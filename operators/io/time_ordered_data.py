@@ -252,7 +252,8 @@ class TimeOrderedData:
         self.flags = in_file(observation.flags, SAMPLE_FLAGS)
         self.detector_flags = in_file(observation.detector_flags, DETECTOR_FLAGS)
         trimmed = intervals_of(
-            (observation.flags & np.uint8(TRIMMED | PROCESSING)) == TRIMMED, observation.seconds
+            (observation.flags & np.uint8(TRIMMED | PROCESSING)) == TRIMMED,
+            observation.seconds,
         )
         self.intervals = {
             **observation.intervals,
@@ -262,7 +263,9 @@ class TimeOrderedData:
     def sample_flags(self, mask: int) -> Flags:
         """(n_samp,) bits of `core.flags`; ``mask``: bits of the file that exclude a sample."""
         return from_file(
-            self.flags, mask, samples_in(self.intervals.get(TRIMMED_INTERVALS, []), self.seconds)
+            self.flags,
+            mask,
+            samples_in(self.intervals.get(TRIMMED_INTERVALS, []), self.seconds),
         )
 
     @property
@@ -333,7 +336,8 @@ class TimeOrderedData:
             weather=o.weather,
             hwp_angle=o.hwp_angle,
             azimuth=np.asarray(
-                o.azimuth if o.recorded_azimuth is None else o.recorded_azimuth, np.float64
+                o.azimuth if o.recorded_azimuth is None else o.recorded_azimuth,
+                np.float64,
             ),
             metadata={
                 "seed": o.seed,

@@ -100,7 +100,9 @@ class Writer(TodWriter):
                 np.sum(values)
             ):  # what is no number in one stream is not to be used in any
                 self._flags()[detectors, samples] |= np.where(
-                    np.isfinite(values), np.uint8(0), np.uint8(INVALID)
+                    np.isfinite(values),
+                    np.uint8(0),
+                    np.uint8(INVALID),
                 )
             self._disk.check()
 
@@ -270,7 +272,8 @@ def _write_noise(group: Any, tod: TimeOrderedData, frequency: AnyFloats, psd: An
         "unit"
     ] = "1 / K2"
     group.create_dataset(
-        "mixing_matrix", data=np.array([(d, d, 1.0) for d in names], f"S{width}, S{width}, f4")
+        "mixing_matrix",
+        data=np.array([(d, d, 1.0) for d in names], f"S{width}, S{width}, f4"),
     )
     group.create_dataset("psds", data=np.vstack([frequency, psd]).astype("f4"))
     group.create_dataset("psds_indices", data=np.array([name_uid(d) for d in tod.names], np.uint32))
@@ -286,7 +289,8 @@ def _write_shared(file: Any, tod: TimeOrderedData) -> None:
     for name, spans in tod.intervals.items():
         at = np.searchsorted(tod.seconds, np.reshape(spans, (-1, 2)).T)
         intervals.create_dataset(
-            name, data=tod.times[np.minimum(at, tod.n_samples - 1)]
+            name,
+            data=tod.times[np.minimum(at, tod.n_samples - 1)],
         )  # to the last bit those of samples
 
 
@@ -375,7 +379,9 @@ class Reader:
         if model is not None and model not in have:
             cure = f"choose from: {', '.join(have)}" if have else "leave noise_model out"
             raise InputError(
-                f"has no noise model {model!r} (/metadata)", place=self.place, cure=cure
+                f"has no noise model {model!r} (/metadata)",
+                place=self.place,
+                cure=cure,
             )
         with self._reading():
             group, unused = (
@@ -410,7 +416,9 @@ class Reader:
         if isinstance(item, h5py.Dataset) and (item.shape != shape or item.dtype.kind not in "fiu"):
             what = f"{item.name.lstrip('/')} is {' x '.join(map(str, item.shape))} of {item.dtype}"
             raise InputError(
-                f"{what}, not {shape[0]} x {shape[1]} numbers", place=self.place, cure=AGAIN
+                f"{what}, not {shape[0]} x {shape[1]} numbers",
+                place=self.place,
+                cure=AGAIN,
             )
 
 
@@ -450,7 +458,8 @@ def _rectangle(item: Any, rows: NDArray[np.intp], samples: slice) -> Any:
         from flacarray.hdf5 import read_array
     except ImportError:
         raise InputError(
-            f"{item.name} is compressed with FLAC", cure="pip install flacarray"
+            f"{item.name} is compressed with FLAC",
+            cure="pip install flacarray",
         ) from None  # the extra flac
     keep = np.zeros(int(item["stream_starts"].shape[0]), bool)
     keep[rows] = True
@@ -522,7 +531,8 @@ def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
         if theirs in table.colnames:
             values = table[theirs][rows]
             columns[ours] = np.array(
-                u.Quantity(values, unit).to_value(si) if unit else values, np.float64
+                u.Quantity(values, unit).to_value(si) if unit else values,
+                np.float64,
             )
     if "pol_leakage" in table.colnames:
         epsilon = np.asarray(table["pol_leakage"][rows], np.float64)

@@ -62,7 +62,9 @@ def columns_of_model(
         parts = {key: weight for key, weight in mixed[detector].items() if weight != 0}
         if not parts or not parts.keys() <= spectra.keys():
             raise InputError(
-                f"{group.name} has no spectrum of detector {detector}", place=place, cure=NOISE_CURE
+                f"{group.name} has no spectrum of detector {detector}",
+                place=place,
+                cure=NOISE_CURE,
             )
         frequency = spectra[next(iter(parts))][0]
         total = np.array([w**2 * np.interp(frequency, *spectra[k]) for k, w in parts.items()])
@@ -113,7 +115,9 @@ def fit(frequency: Floats, power: Floats, place: str) -> Floats:
     sound = len(frequency) >= 4 and np.isfinite(power).all() and (power > 0).all()
     if not sound or (np.diff(frequency) <= 0).any():
         raise InputError(
-            "has a spectrum that is not positive and finite", place=place, cure=NOISE_CURE
+            "has a spectrum that is not positive and finite",
+            place=place,
+            cure=NOISE_CURE,
         )
     x, y = np.log(frequency), np.log(power)
     if len(x) > BINS:

@@ -146,7 +146,14 @@ class RunsOfTiles:
                 at[row] += number
                 begin += number
         return CompressedScan(
-            self.length, rate, self.n_samples, pixel, samples, first, self.counted, angles
+            self.length,
+            rate,
+            self.n_samples,
+            pixel,
+            samples,
+            first,
+            self.counted,
+            angles,
         )
 
     @property

@@ -60,7 +60,9 @@ class MapFromSums:
             if key in data.products:
                 text = f"two steps make the product {self.parameters.product!r}"
                 raise PipelineError(
-                    text, place=self.parameters.label, cure="give one of them another product name"
+                    text,
+                    place=self.parameters.label,
+                    cure="give one of them another product name",
                 )
             product = self.map_of(stream)
             product.band = data.scene.instrument.band
@@ -205,7 +207,10 @@ class MapFromSums:
         if product.polarization is not None:
             hit = int(np.count_nonzero(product.hits))
             log.count(
-                self.parameters.label, UNSOLVED, hit - int(np.count_nonzero(product.known)), hit
+                self.parameters.label,
+                UNSOLVED,
+                hit - int(np.count_nonzero(product.known)),
+                hit,
             )
         if self.parameters.noise == "scatter":
             alone = int(np.count_nonzero(product.hits == 1))
@@ -229,11 +234,15 @@ class MapFromSums:
         if self.sums.unknown_variance:
             log.state(self.parameters.label, "weights", "uniform: every NET is 0")
         log.state(
-            self.parameters.label, "fixed-point step of the sums", f"{1 / VALUE:.1e} K per sample"
+            self.parameters.label,
+            "fixed-point step of the sums",
+            f"{1 / VALUE:.1e} K per sample",
         )
         if not self.sums.of_scans:
             log.state(
-                self.parameters.label, "half-difference of", DIFFERENCES[self.parameters.split]
+                self.parameters.label,
+                "half-difference of",
+                DIFFERENCES[self.parameters.split],
             )
         if self.parameters.half_difference and not self.sums.halved:
             log.state(self.parameters.label, "half-difference", "not made: it needs two scans")

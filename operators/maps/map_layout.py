@@ -196,7 +196,8 @@ class MapLayout:
         together: dict[tuple[float, float], list[Observation]] = {}
         for observation in observations:
             together.setdefault(
-                asked.centre.icrs() if asked.centre else observation.centre, []
+                asked.centre.icrs() if asked.centre else observation.centre,
+                [],
             ).append(observation)
         known = {(field[0], field[1]): field for field in found}
         for icrs, scans in together.items():

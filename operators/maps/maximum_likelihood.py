@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import threading
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal
@@ -29,11 +29,10 @@ from zonda.core.data import Block, Data, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.chunks import TILE_SAMPLES
-from zonda.core.product import Product
 from zonda.core.signal import MAIN
 from zonda.core.types import AnyFloats, Floats
 
-from .baseline_noise import BaselineNoise, estimate
+from .baseline_noise import estimate
 from .bin_map import BinMap, Prepared
 from .binning import Weights, binnings
 from .compressed_scan import CompressedScan, RunsOfTiles, Tile, add_baselines
@@ -41,7 +40,13 @@ from .intensity_kernel import VALUE, WEIGHT
 from .map_from_sums import MapFromSums
 from .map_layout import MapLayout
 from .map_sums import MapSums
-from .normal_equations import NormalEquations, Solution, WeighedScan
+from .normal_equations import (
+    Compressed,
+    CompressedScans,
+    NormalEquations,
+    Solution,
+    WeighedScan,
+)
 
 LEAST_POWER, FREEDOM = 0.2, 40
 """Of slow baselines, in units of white noise: less is left where a filter has removed slow noise.
@@ -423,53 +428,6 @@ class LikelihoodScan:
             s = self.common[name] / (VALUE * self.scale)
             data[name] = (y, scan.about_means(s, y, a, self.nowhere))
         return Compressed(scan, self.noise, data)
-
-
-@dataclass
-class Compressed:
-    """A compressed scan, its noise, and y and s of its signals."""
-
-    scan: CompressedScan
-    noise: BaselineNoise
-    data: dict[str, tuple[Floats, Floats]]
-
-
-class CompressedScans(Product):
-    """Compressed scans, in their order."""
-
-    def __init__(self, scans: list[Compressed]) -> None:
-        self.scans = scans
-
-    def __iadd__(self, other: CompressedScans) -> CompressedScans:
-        self.scans += other.scans
-        return self
-
-    def arrays(self) -> Mapping[str, Any]:
-        """See `Product.arrays`."""
-        return {
-            "scans": [
-                {
-                    "scan": vars(c.scan),
-                    "noise": vars(c.noise),
-                    "data": {n: list(d) for n, d in c.data.items()},
-                }
-                for c in self.scans
-            ]
-        }
-
-    @classmethod
-    def of(cls, arrays: Mapping[str, Any]) -> CompressedScans:
-        """See `Product.of`."""
-        return cls(
-            [
-                Compressed(
-                    CompressedScan(**one["scan"]),
-                    BaselineNoise(**one["noise"]),
-                    {name: tuple(pair) for name, pair in one["data"].items()},
-                )
-                for one in arrays["scans"]
-            ]
-        )
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,13 @@ matrix: where the smallest is far below 1 there are patterns that the data hardl
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from zonda.core.product import Product
 from zonda.core.stream import in_order
 from zonda.core.types import Floats
 
@@ -35,6 +36,53 @@ SINGULAR = 1e-8
 UNDETERMINED = 1e-8
 """A direction p with less information p^T A p, as a share of that of white noise, p^T W p with the
 weights W of pixels, holds rounding alone."""
+
+
+@dataclass
+class Compressed:
+    """A compressed scan, its noise, and y and s of its signals."""
+
+    scan: CompressedScan
+    noise: BaselineNoise
+    data: dict[str, tuple[Floats, Floats]]
+
+
+class CompressedScans(Product):
+    """Compressed scans, in their order."""
+
+    def __init__(self, scans: list[Compressed]) -> None:
+        self.scans = scans
+
+    def __iadd__(self, other: CompressedScans) -> CompressedScans:
+        self.scans += other.scans
+        return self
+
+    def arrays(self) -> Mapping[str, Any]:
+        """See `Product.arrays`."""
+        return {
+            "scans": [
+                {
+                    "scan": vars(c.scan),
+                    "noise": vars(c.noise),
+                    "data": {n: list(d) for n, d in c.data.items()},
+                }
+                for c in self.scans
+            ]
+        }
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Any]) -> CompressedScans:
+        """See `Product.of`."""
+        return cls(
+            [
+                Compressed(
+                    CompressedScan(**one["scan"]),
+                    BaselineNoise(**one["noise"]),
+                    {name: tuple(pair) for name, pair in one["data"].items()},
+                )
+                for one in arrays["scans"]
+            ]
+        )
 
 
 class WeighedScan(NamedTuple):

@@ -50,7 +50,8 @@ def halves_of(split: Split, observation: Observation) -> list[tuple[Mask, Mask]]
         return [(even, samples), (~even, samples)]
     if split == "radii":
         order = np.argsort(
-            np.hypot(observation.focalplane.xi, observation.focalplane.eta), kind="stable"
+            np.hypot(observation.focalplane.xi, observation.focalplane.eta),
+            kind="stable",
         )
         inner = np.zeros_like(detectors)
         inner[order[: (order.size + 1) // 2]] = True

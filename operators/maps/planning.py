@@ -36,11 +36,13 @@ class BinMapPlanning(Planning[BinMap]):
         side = math.sqrt(4 * math.pi / (12 * step.nside**2)) if step.nside else step.pixel
         if step.projection == "CAR" and not step.nside:
             _, latitude = in_frame(
-                step.centre.icrs() if step.centre else observation.centre, step.frame
+                step.centre.icrs() if step.centre else observation.centre,
+                step.frame,
             )
             side *= math.sqrt(max(math.cos(latitude), side))
         return Traits(
-            pixel=side, weighs=step.weights == "inverse_variance" and step.contents == "all"
+            pixel=side,
+            weighs=step.weights == "inverse_variance" and step.contents == "all",
         )
 
     def memory(self, observation: Observation) -> int:

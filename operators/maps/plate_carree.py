@@ -131,7 +131,8 @@ def _joined(one: Box | None, other: Box, pixel: float) -> Box:
     around = 2 * rows_of(pixel)
     shifted = [(other[0] + k * around, other[2] + k * around) for k in (-1, 0, 1)]
     left, right = min(
-        ((min(one[0], a), max(one[2], b)) for a, b in shifted), key=lambda ends: ends[1] - ends[0]
+        ((min(one[0], a), max(one[2], b)) for a, b in shifted),
+        key=lambda ends: ends[1] - ends[0],
     )
     return _whole((left, min(one[1], other[1]), right, max(one[3], other[3])), pixel)
 

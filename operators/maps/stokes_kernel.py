@@ -140,7 +140,18 @@ def add_stokes(  # type: ignore[no-untyped-def]
                     limit, dropped = _limit(bands[lot][0][k]), bands[lot][3]
                     where = rows[k], low, lot * m, m
                     number, top = _without(
-                        signals, where, cell, fine, limit, size, c, s, share, values, kept, dropped
+                        signals,
+                        where,
+                        cell,
+                        fine,
+                        limit,
+                        size,
+                        c,
+                        s,
+                        share,
+                        values,
+                        kept,
+                        dropped,
                     )
                     pixels, tops[lot] = kept[:number], top
                 n_runs, alike = _runs(pixels, run, begins, places), n_bands == 1 or not spoilt
@@ -193,7 +204,16 @@ def add_stokes(  # type: ignore[no-untyped-def]
                             b * m + i if i < m else (n_bands - 1) * m + i,
                         )
                         running_terms(
-                            c, s, x, values, np.uint64(line), signals[:1], MAGIC, run, number, few
+                            c,
+                            s,
+                            x,
+                            values,
+                            np.uint64(line),
+                            signals[:1],
+                            MAGIC,
+                            run,
+                            number,
+                            few,
                         )
                         if i == 0:
                             _add(sums, few, signals[:1], 0, places, begins, n_runs, every_w)
@@ -202,11 +222,27 @@ def add_stokes(  # type: ignore[no-untyped-def]
                             (FIRST, 1) if i == m else (DATA + 3 * min(i, m), 3 if i < m else 1)
                         )
                         _add_lanes(
-                            sums, column, few, signals[:1], LAST, lanes, places, begins, n_runs
+                            sums,
+                            column,
+                            few,
+                            signals[:1],
+                            LAST,
+                            lanes,
+                            places,
+                            begins,
+                            n_runs,
                         )
                         if i > m:
                             _add_lanes(
-                                sums, column + 1, few, signals[:1], 0, LAST, places, begins, n_runs
+                                sums,
+                                column + 1,
+                                few,
+                                signals[:1],
+                                0,
+                                LAST,
+                                places,
+                                begins,
+                                n_runs,
                             )
 
 
@@ -271,7 +307,8 @@ def _without(  # type: ignore[no-untyped-def]
         for t in range(row.size):
             one = abs(np.float64(row[t]))
             size[t] = max(
-                size[t] if i > begin else 0.0, one if one < np.inf else np.inf
+                size[t] if i > begin else 0.0,
+                one if one < np.inf else np.inf,
             )  # NaN is not below anything
     for t in range(pixels.size):
         if not fine[t] or not size[t] < np.inf or pixels[t] < 0 or size[t] >= limit:

@@ -123,7 +123,12 @@ def spectrum(
 
     good = good & np.isfinite(row)
     found, _, power = spectrogram(
-        np.where(good, row, 0.0), rate, "hann", length, length // 2, detrend=detrend
+        np.where(good, row, 0.0),
+        rate,
+        "hann",
+        length,
+        length // 2,
+        detrend=detrend,
     )
     spoilt, begins = np.r_[0, np.cumsum(~good)], np.arange(power.shape[1]) * (length // 2)
     whole = spoilt[begins + length] == spoilt[begins]

@@ -80,7 +80,8 @@ class NoiseLevel:
         if self.model.reference == "sky":
             return self.net(observation)
         calibration = rms_of_inverse(
-            observation.smooth.get("transmission"), observation.n_detectors
+            observation.smooth.get("transmission"),
+            observation.n_detectors,
         )
         return self.net(observation) * calibration / observation.focalplane.main_beam_efficiency
 
@@ -92,10 +93,13 @@ class NoiseLevel:
         rough.smooth = {}
         if observation.expected_load is not None and self.follows_load:
             for name, value in zip(
-                ("atmosphere", "transmission"), observation.expected_load(), strict=True
+                ("atmosphere", "transmission"),
+                observation.expected_load(),
+                strict=True,
             ):
                 rough.smooth[name] = SmoothField.constant(
-                    np.full(observation.n_detectors, value), observation.n_samples
+                    np.full(observation.n_detectors, value),
+                    observation.n_samples,
                 )
         return NoiseLevel(self.model, self.scatter, self.label).sky_net(rough)
 
@@ -192,7 +196,9 @@ def rms_of_inverse(transmission: SmoothField | None, n_detectors: int) -> Floats
         squares = np.where(clear, 1 / np.maximum(passed, LEAST_TRANSMISSION) ** 2, 0.0).sum(axis=1)
         number = clear.sum(axis=1)
         found[rows] = np.where(
-            number > 0, np.sqrt(squares / np.maximum(number, 1)), 1 / LEAST_TRANSMISSION
+            number > 0,
+            np.sqrt(squares / np.maximum(number, 1)),
+            1 / LEAST_TRANSMISSION,
         )
     return found
 

@@ -107,7 +107,9 @@ class PinkNoise(Operator):
         add = "pink" in block.detdata
         out = block.new("pink", zero=False)
         level = state.amplitude.of(block.observation).series(
-            block.detectors, block.samples, out.dtype
+            block.detectors,
+            block.samples,
+            out.dtype,
         )
         shared = state.common[..., block.samples]
         state.streams.add(
@@ -127,7 +129,9 @@ class PinkNoise(Operator):
                 state.amplitude.of(observation).time_mean() * np.sqrt(state.streams.variance)
             )
             observation.log.state(
-                self.label, "rms at the detector, median (mK)", f"{1e3 * middle:.4g}"
+                self.label,
+                "rms at the detector, median (mK)",
+                f"{1e3 * middle:.4g}",
             )
 
 
@@ -143,7 +147,9 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
     """Raises InputError as `PinkSpectrum.filters`."""
     laws, slopes = spectrum.filters(pink), spectrum.different
     observation.log.state(
-        pink.label, "power over that of white noise", spectrum.describe(laws[spectrum.slope])
+        pink.label,
+        "power over that of white noise",
+        spectrum.describe(laws[spectrum.slope]),
     )
     resolve(observation)
     level = level_of(pink, observation)

@@ -138,7 +138,8 @@ class Streams:
     def _first_state(self, number: int) -> NDArray[np.float32]:
         n, sections = len(self.law.start), self.law.poles.size
         deviates = normals(self.start_key, 0, n * TILE_DETECTORS, stream=number).reshape(
-            n, TILE_DETECTORS
+            n,
+            TILE_DETECTORS,
         )
         begun = self.law.start @ deviates
         state = np.zeros((self._rate.size + n - sections, TILE_DETECTORS), np.float32)
@@ -235,7 +236,12 @@ def _filter(  # type: ignore[no-untyped-def]
         if origin % TILE == 0 and 16 * m % TILE == 0:
             for k in range(16 * m // TILE):
                 normal_tile(
-                    key, tile, origin // TILE + k, words, bits, x[k * TILE : (k + 1) * TILE]
+                    key,
+                    tile,
+                    origin // TILE + k,
+                    words,
+                    bits,
+                    x[k * TILE : (k + 1) * TILE],
                 )
         else:
             fill_normals(key, tile, origin, x[: 16 * m])

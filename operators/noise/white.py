@@ -107,7 +107,9 @@ class WhiteNoise(Operator):
         add = "white" in block.detdata
         out = block.new("white", zero=False)
         level = state.amplitude.of(block.observation).series(
-            block.detectors, block.samples, out.dtype
+            block.detectors,
+            block.samples,
+            out.dtype,
         )
         _add_normals(state.key, block.detectors.start, block.samples.start, *level, add, out)
 

@@ -133,7 +133,9 @@ class Efficiency(Operator):
             share, error = gain * epsilon / zeta, 0.0
             if transmission is not None:
                 ratio, error = field_ratio(
-                    ratio, transmission, np.flatnonzero(observation.good_detectors)
+                    ratio,
+                    transmission,
+                    np.flatnonzero(observation.good_detectors),
                 )
             mean = ratio.scaled(share)
             text = f"{error * np.abs(share).max():.1e} K_RJ"
@@ -181,7 +183,8 @@ def _make_signal(block: Block, state: Calibration, instantaneous: bool) -> int:
     first = np.array([block.samples.start, divisor.first, level.first], np.int64)
     smooth = divisor.lines, divisor.inside, level.lines, level.inside
     factors = np.array(
-        [a[block.detectors] for a in (state.gain, state.epsilon, state.zeta)], block.dtype
+        [a[block.detectors] for a in (state.gain, state.epsilon, state.zeta)],
+        block.dtype,
     )
     if noisy or instantaneous:
         clipped = _calibrate(*streams, first, *smooth, factors, instantaneous, signal)

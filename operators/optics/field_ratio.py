@@ -42,7 +42,8 @@ def field_ratio(
     while True:
         known = _ratio(above, below, step, rows)
         tolerance = TOLERANCE * max(
-            float(np.abs(known[np.isin(rows, use), 1:-1]).max(initial=0.0)), 1e-30
+            float(np.abs(known[np.isin(rows, use), 1:-1]).max(initial=0.0)),
+            1e-30,
         )
         nodes = above.weights.astype(np.float64)
         fits = [

@@ -71,7 +71,9 @@ class GroundPickup(Operator):
         gains = np.ones(observation.n_detectors)
         if self.scatter > 0:
             gains += self.scatter * normals(
-                observation.camera_key(self.label), 0, len(gains)
+                observation.camera_key(self.label),
+                0,
+                len(gains),
             ).astype(np.float64)
         return gains, profile
 

@@ -95,7 +95,8 @@ class HalfWavePlate(Operator):
     def configure(self, observation: Observation) -> None:
         """Set `Observation.hwp_angle`."""
         observation.hwp_angle = np.mod(
-            2 * np.pi * self.frequency * observation.seconds + self.angle, 2 * np.pi
+            2 * np.pi * self.frequency * observation.seconds + self.angle,
+            2 * np.pi,
         )
 
     def prepare(self, observation: Observation) -> None:

@@ -76,7 +76,8 @@ class PointingBackAndForth(Pointing):
         for chunk in chunks(len(seconds)):
             x, _ = self.path(seconds[chunk])
             found[chunk] = unit_vectors(
-                longitude - (x + aim.offset[0]) / math.cos(elevation), np.full(len(x), elevation)
+                longitude - (x + aim.offset[0]) / math.cos(elevation),
+                np.full(len(x), elevation),
             )
         return found
 

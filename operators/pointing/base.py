@@ -113,7 +113,9 @@ class Scans(Operator):
         looked = self.some(scans)
         lengths = [self.length(scan) for scan in looked]
         self._observe(
-            data, looked, min(rate, max(INSTANTS_LOOKED_AT / sum(lengths), 1 / max(lengths)))
+            data,
+            looked,
+            min(rate, max(INSTANTS_LOOKED_AT / sum(lengths), 1 / max(lengths))),
         )
         made = data.observations[first:]
         for observation, length in zip(made, lengths, strict=True):
@@ -241,11 +243,15 @@ class Pointing(Scans):
             if target.frame == "horizontal":
                 x, y = self.path(seconds[chunk])
                 found[chunk] = _on_tangent_plane(
-                    -target.longitude, target.latitude, -(x + offset[0]), y + offset[1]
+                    -target.longitude,
+                    target.latitude,
+                    -(x + offset[0]),
+                    y + offset[1],
                 )
             else:
                 found[chunk] = aim.transform.horizontal(
-                    self._on_the_sky(aim, seconds[chunk]), seconds[chunk]
+                    self._on_the_sky(aim, seconds[chunk]),
+                    seconds[chunk],
                 )
         return found
 
@@ -415,7 +421,8 @@ class Pointing(Scans):
 
         def track(scan: Pointing, step: float) -> Floats:
             return scan.directions(
-                aim, np.arange(max(round(length / step), 1), dtype=np.float64) * step
+                aim,
+                np.arange(max(round(length / step), 1), dtype=np.float64) * step,
             )
 
         def of(scan: Pointing) -> dict[Quantity, LargestDerivative]:
@@ -432,7 +439,11 @@ class Pointing(Scans):
             found,
             place if self.check_limits == "error" else "",
             lambda over: what_fits(
-                self, self.slows, found, over, lambda scan: not excess(of(scan), limits)
+                self,
+                self.slows,
+                found,
+                over,
+                lambda scan: not excess(of(scan), limits),
             ),
         )
 

@@ -65,7 +65,9 @@ class Mispointing(Operator):
             ]  # of the focal plane: xi is not along the azimuth then
             cosine, sine = np.cos(turned), np.sin(turned)
             observation.pointed_radec = beside(
-                observation.sky_boresight, x * cosine - y * sine, y * cosine + x * sine
+                observation.sky_boresight,
+                x * cosine - y * sine,
+                y * cosine + x * sine,
             )
             rms = np.degrees([np.sqrt(np.mean(x * x)), np.sqrt(np.mean(y * y))]) * 3600
             what = f"{observation.name}: rms error towards azimuth and elevation"
@@ -81,7 +83,8 @@ class Mispointing(Operator):
             rho = math.exp(-1 / (self.jitter_time * observation.sample_rate))
             for k in (0, 1):
                 found[k] += self.jitter_rms * _markov(
-                    rho, normals(key, 0, n, stream=1 + k).astype(np.float64)
+                    rho,
+                    normals(key, 0, n, stream=1 + k).astype(np.float64),
                 )
         return found[0], found[1]
 

@@ -78,7 +78,8 @@ def motion(
         The same track in steps of so many seconds, where samples are too far apart.
     """
     stride = 1 << max(
-        0, math.ceil(math.log2(max(len(horizontal) / POINTS, rate * SHORTEST_STEP, 1e-9)))
+        0,
+        math.ceil(math.log2(max(len(horizontal) / POINTS, rate * SHORTEST_STEP, 1e-9))),
     )
     step = stride / rate
     while True:
@@ -115,7 +116,8 @@ def _peaks(track: Floats, step: float) -> dict[Quantity, LargestDerivative]:
         around = rates[max(k - 1, 0) : k + 2]
         bend = 2 * largest - float(around[0] + around[-1]) if len(around) == 3 else 0.0
         error = max(
-            abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3, bend * (3 + order) / 24
+            abs(largest - float(coarse[axis, order].max(initial=0.0))) / 3,
+            bend * (3 + order) / 24,
         )
         there = float(elevation[min(k + order // 2, len(elevation) - 1)])
         found[axis, order] = LargestDerivative(largest, (k + order / 2) * step, there, error)
@@ -174,7 +176,9 @@ class SamplesPerBeam:
     def add(self, observation: Observation, rate: float) -> None:
         """Take a scan into account, read out at ``rate`` [Hz]."""
         speed, turn = on_the_sky(
-            observation.boresight_radec, observation.seconds, observation.good_samples
+            observation.boresight_radec,
+            observation.seconds,
+            observation.good_samples,
         )
         total = speed + turn * math.atan(observation.focalplane.radius)
         if len(total) and total.max() > self._fastest:

@@ -61,7 +61,8 @@ def sunlit(
     near, above = np.zeros(len(seconds), bool), np.zeros(len(seconds), bool)
     for part in chunks(len(seconds)):
         towards = np.stack(
-            [np.interp(seconds[part], nodes, one) for one in sun.direction.T], axis=1
+            [np.interp(seconds[part], nodes, one) for one in sun.direction.T],
+            axis=1,
         )
         above[part] = towards[:, 2] > 0
         near[part] = Track(looking(azel[part])).distance(Track(towards)) < close
@@ -73,7 +74,10 @@ def sunlit(
 def mark_sun(observation: Observation) -> None:
     """Give an observation the flags and intervals of `sunlit`."""
     flags, intervals = sunlit(
-        observation.site, observation.start, observation.seconds, observation.boresight_azel
+        observation.site,
+        observation.start,
+        observation.seconds,
+        observation.boresight_azel,
     )
     observation.flags |= flags
     observation.intervals.update(intervals)
@@ -99,7 +103,9 @@ def distances(observations: Sequence[Observation]) -> list[str]:
     when, track = np.concatenate(times), Track(np.concatenate(directions))
     lines = []
     for name, body in zip(
-        ("Sun", "Moon"), tracks(observations[0].site, when, "sun", "moon"), strict=True
+        ("Sun", "Moon"),
+        tracks(observations[0].site, when, "sun", "moon"),
+        strict=True,
     ):
         apart, up = np.degrees(track.distance(body)), body.elevation > math.radians(-0.5)
         where = "up" if up.all() else "up part of the time" if up.any() else "below the horizon"
@@ -159,7 +165,8 @@ def observed(
     observation.log.state(label, "Earth orientation", transform.source)
     if not transform.orientation_known:
         warnings.warn(
-            f"{label}: Earth orientation at {transform.start}: {transform.source}", stacklevel=4
+            f"{label}: Earth orientation at {transform.start}: {transform.source}",
+            stacklevel=4,
         )
     return observation
 

@@ -120,7 +120,9 @@ class PointingRecorded(Operator):
     def _read(self) -> tuple[Recording, Comb]:
         place = f"{self.label}, {self.file}"
         recording = _on_the_sky(
-            read_recording(self.file, self.clock, self.flag_mask), self.celestial, place
+            read_recording(self.file, self.clock, self.flag_mask),
+            self.celestial,
+            place,
         )
         return recording, comb(recording, self.split, place)
 
@@ -159,7 +161,9 @@ class PointingRecorded(Operator):
             centre=centre,
             flags=scan.flags.copy(),
             intervals=cut_intervals(
-                recording.intervals, float(scan.seconds[0]), float(scan.seconds[-1])
+                recording.intervals,
+                float(scan.seconds[0]),
+                float(scan.seconds[-1]),
             ),
         )
         state_times(self.label, observation)
@@ -235,7 +239,8 @@ def _state_celestial(
     if observation.boresight_radec is not computed:
         looked = np.flatnonzero(good)[:: max(1, int(good.sum()) // MOST_CHECKED)]
         apart = np.linalg.norm(
-            directions(observation.boresight_radec[looked]) - directions(computed[looked]), axis=1
+            directions(observation.boresight_radec[looked]) - directions(computed[looked]),
+            axis=1,
         )
         most = 2 * float(np.arcsin(apart.max(initial=0.0) / 2))
         text = f"as recorded, up to {np.degrees(most) * 3600:.3g} arcsec from those {text}"

@@ -149,13 +149,19 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
             continue
         scans.append(
             _scan(
-                recording, rows[part], seconds[part], ahead[part[:-1]].astype(np.int64), good[part]
+                recording,
+                rows[part],
+                seconds[part],
+                ahead[part[:-1]].astype(np.int64),
+                good[part],
             )
         )
     counts["rows alone between gaps, dropped"] = alone
     if not scans:
         raise InputError(
-            "no two consecutive directions are numbers", place=place, cure="check the columns"
+            "no two consecutive directions are numbers",
+            place=place,
+            cure="check the columns",
         )
     missing = sum(len(s.seconds) for s in scans) - (len(rows) - alone)
     flagged = sum(int(np.count_nonzero(s.flags & NOT_RECORDED)) for s in scans)

@@ -408,7 +408,9 @@ def _times(times: Floats, clock: Clock, place: str) -> tuple[Floats, Instant | N
     finite = times[np.isfinite(times)]
     if not len(finite):
         raise InputError(
-            "has no time that is a number", place=place, cure="check the column of times"
+            "has no time that is a number",
+            place=place,
+            cure="check the column of times",
         )
     first, days = int(np.floor(finite[0])), clock == "mjd"
     try:

@@ -234,7 +234,8 @@ def _rows(table: Table, nods: float) -> list[Row]:
         told = ", ".join(f"{found[k].label} (line {table.lines[k]})" for k in empty[:3])
         more = ", ..." if len(empty) > 3 else ""
         warnings.warn(
-            f"{table.place}: stop_time is start_time in {told}{more}: left out", stacklevel=2
+            f"{table.place}: stop_time is start_time in {told}{more}: left out",
+            stacklevel=2,
         )
     if len(empty) == len(found):
         table.note(None, "has no row that lasts", "give rows whose stop_time is later")
@@ -439,7 +440,9 @@ class PointingSchedule(ScheduleParameters):
 
         def track(at: Floats) -> Floats:
             azimuth = row.azimuth[0] + np.where(
-                at >= delay, sweep.path(np.maximum(at - delay, 0.0)), 0.0
+                at >= delay,
+                sweep.path(np.maximum(at - delay, 0.0)),
+                0.0,
             )
             elevation = row.elevation + np.where(at < delay, nod.path(at), 0.0)
             return unit_vectors(-azimuth, elevation)

@@ -339,5 +339,6 @@ def draw(spectra: Floats, nside: int, key: Any) -> Floats:
     own = np.sqrt(np.maximum(ee - shared**2, 0.0))
     polarized = [shared[ell] * first + own[ell] * deviates(1), np.sqrt(bb)[ell] * deviates(2)]
     return np.asarray(
-        healpy.alm2map([intensity, *polarized], nside, lmax=lmax, pol=True), np.float64
+        healpy.alm2map([intensity, *polarized], nside, lmax=lmax, pol=True),
+        np.float64,
     )

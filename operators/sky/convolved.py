@@ -314,7 +314,12 @@ class ConvolvedSky(SkyInput):
             how = "interpolated (third order) onto"
             where += "; its error falls with the third power of the input's pixel size"
             planes, covered, counts[POOR] = interpolated(
-                source, grid.wcs, grid.tiles, progress, found.per_area, axis
+                source,
+                grid.wcs,
+                grid.tiles,
+                progress,
+                found.per_area,
+                axis,
             )
             planes *= factor
             planes[0, ~covered] = self.outside
@@ -341,7 +346,11 @@ class ConvolvedSky(SkyInput):
             def convolved(values: Floats, outside: float) -> Convolved:
                 if evenly is not None:
                     return convolve_evenly(
-                        values, grid.step, evenly.variance(fwhm), outside, linear
+                        values,
+                        grid.step,
+                        evenly.variance(fwhm),
+                        outside,
+                        linear,
                     )
                 jacobian = np.radians(np.asarray(grid.wcs.pixel_scale_matrix, np.float64))
                 return convolve(values, jacobian, fwhm, outside, self.pixels_per_fwhm, linear)

@@ -124,7 +124,9 @@ class MapHeader(FileHeader):
             self.notes["unit"] = f"{wanted} as given; {key} = '{written}' is overridden"
         scale = self.text("TEMPSCAL")
         return parse_unit(
-            written if wanted is None else wanted, place=self.place, temperature_scale=scale
+            written if wanted is None else wanted,
+            place=self.place,
+            temperature_scale=scale,
         )
 
     def beam(self, unit: str) -> tuple[float, float] | None:

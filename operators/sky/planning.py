@@ -67,7 +67,9 @@ class SkyPlanning(Planning[SkyMap]):
     knobs = (
         Knob("pixels_per_fwhm", (2, 3, 4, 6, 8), "sky interpolated between points"),
         Knob(
-            "interpolation", ("linear", "cubic"), "sky linear between points, not by cubic splines"
+            "interpolation",
+            ("linear", "cubic"),
+            "sky linear between points, not by cubic splines",
         ),
     )
 

@@ -93,7 +93,10 @@ class PointSources(Operator):
             catalogue.brightness(camera.band, self.scale)
         brightest = float(np.abs(catalogue.flux).max()) * abs(self.scale)
         if text := doubt(
-            f"{self.label}: the brightest source of {self.catalogue.name}", brightest, FLUX, "Jy"
+            f"{self.label}: the brightest source of {self.catalogue.name}",
+            brightest,
+            FLUX,
+            "Jy",
         ):
             warnings.warn(text, stacklevel=2)
         unused = [f"not used: {', '.join(catalogue.unused)}"] if catalogue.unused else []

@@ -91,7 +91,9 @@ def band_weights(band: Band) -> tuple[Floats, Floats]:
     k = np.clip(np.searchsorted(at, points, side="right") - 1, 0, number - 1)
     along = (points - at[k]) / (at[k + 1] - at[k])
     sums = np.bincount(k, shares * (1 - along), number + 1) + np.bincount(
-        k + 1, shares * along, number + 1
+        k + 1,
+        shares * along,
+        number + 1,
     )
     widths = np.full(number + 1, (high - low) / number)
     widths[[0, -1]] /= 2
@@ -124,7 +126,8 @@ def emission(
     with ALONE, _offline(not download), _same_numbers():
         try:
             for component in pysm3.sky.create_components_from_config(
-                _seeded(config, pysm3.models), nside=nside
+                _seeded(config, pysm3.models),
+                nside=nside,
             ):
                 found = np.atleast_2d(
                     component.get_emission(frequencies, weights).to_value(pysm3.units.uK_RJ)
@@ -145,7 +148,9 @@ def _lacks(what: str, place: str, download: bool = False) -> InputError:
         f"correct the path; {own}, or {'check the network' if download else 'set download: true'}"
     )
     return InputError(
-        f"neither files nor templates that PySM has on this machine: {what}", place=place, cure=cure
+        f"neither files nor templates that PySM has on this machine: {what}",
+        place=place,
+        cure=cure,
     )
 
 

@@ -146,7 +146,8 @@ def _beside(first: Any, hdus: Any, header: MapHeader) -> list[Any]:
     beside = [images[k] for k in found]
     if any(hdu.shape != first.shape for hdu in beside):
         raise header.error(
-            "its images of I, Q and U differ in size", "give three images of one grid"
+            "its images of I, Q and U differ in size",
+            "give three images of one grid",
         )
     for hdu in beside:
         check_size(hdu, header.place, whole=not header.wanted.header_alone)

@@ -225,7 +225,17 @@ def _add_map(  # type: ignore[no-untyped-def]
                 beyond += count
                 continue
             inside, front = _locate(
-                h[k], xi[d], eta[d], count, limits[k], constants, ones[k], int32(nx), place, u, v
+                h[k],
+                xi[d],
+                eta[d],
+                count,
+                limits[k],
+                constants,
+                ones[k],
+                int32(nx),
+                place,
+                u,
+                v,
             )
             if covered.size > 0:
                 inside = _count_covered(place, u, v, count, nx, covered)

@@ -208,7 +208,10 @@ class SkyMap(ConvolvedSky):
             )
         if behind:
             observation.log.count(
-                self.label, "samples more than 90 deg from the input map's centre", behind, total
+                self.label,
+                "samples more than 90 deg from the input map's centre",
+                behind,
+                total,
             )
 
 

@@ -87,7 +87,10 @@ def denormals() -> Measured:
 
 
 @checks.add(
-    MACHINE, reference="IEEE 754, to nearest even, no excess precision", limit=0, unit="operations"
+    MACHINE,
+    reference="IEEE 754, to nearest even, no excess precision",
+    limit=0,
+    unit="operations",
 )
 def rounding() -> int:
     """float64 sums, products and quotients that are rounded in another way"""
@@ -112,7 +115,10 @@ def rounding() -> int:
 
 
 @checks.add(
-    MACHINE, reference="60-digit arithmetic (mpmath)", limit=4, unit="units in the last place"
+    MACHINE,
+    reference="60-digit arithmetic (mpmath)",
+    limit=4,
+    unit="units in the last place",
 )
 def elementary_functions() -> Measured:
     """error of exp, log, sin and their like, of vectors as zonda calls them"""

@@ -135,7 +135,8 @@ def over_a_day() -> float:
             worst = largest(
                 worst,
                 angle(
-                    transform.horizontal(sky, seconds), erfa_horizontal(sky, start, seconds, site)
+                    transform.horizontal(sky, seconds),
+                    erfa_horizontal(sky, start, seconds, site),
                 ),
             )
     return worst
@@ -150,7 +151,8 @@ def exact_start() -> Measured:
         late = Instant(early.nanoseconds + shift)
         one = CelestialTransform(SITES[0], early, 500.0).horizontal(sky, np.array([shift / 1e9]))
         worst = largest(
-            worst, angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1)))
+            worst,
+            angle(one, CelestialTransform(SITES[0], late, 0.0).horizontal(sky, np.zeros(1))),
         )
     return worst, "0.24 us, the rounding of 1.8e9 s in float64, would be 1.7e-11 rad"
 
@@ -165,7 +167,8 @@ def erfa_horizontal(sky: Floats, start: Instant, seconds: Floats, site: Site) ->
     below = np.array([(start.nanoseconds + round(s * 1e9)) % 1000 for s in seconds])
     with warnings.catch_warnings():
         warnings.simplefilter(
-            "ignore", erfa.ErfaWarning
+            "ignore",
+            erfa.ErfaWarning,
         )  # leap seconds of dates to come are unknown
         second = np.array([t.second + t.microsecond / 1e6 for t in when]) + below / 1e9
         fields = (

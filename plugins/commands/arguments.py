@@ -40,7 +40,8 @@ def instant_of(text: str | None) -> Instant:
     from zonda.core.configuration.time import Instant
 
     made: Instant = checked(
-        "--time", lambda: Instant.parse(text or datetime.now(UTC).replace(second=0, microsecond=0))
+        "--time",
+        lambda: Instant.parse(text or datetime.now(UTC).replace(second=0, microsecond=0)),
     )
     return made
 

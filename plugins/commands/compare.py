@@ -104,7 +104,9 @@ def _twice(flag: str, name: str, metavar: str, text: str) -> Any:
     help="Common resolution (FWHM), e.g. '20 arcsec'.  [default: the wider of the two]",
 )
 @click.option(
-    "--sky", is_flag=True, help="REFERENCE is a sky before any beam: it gets the whole common beam."
+    "--sky",
+    is_flag=True,
+    help="REFERENCE is a sky before any beam: it gets the whole common beam.",
 )
 @click.option(
     "--aperture",

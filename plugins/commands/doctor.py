@@ -32,7 +32,8 @@ def doctor(as_json: bool) -> None:
     from zonda.plugins.checks.scenes import MACHINE
 
     chosen = sorted(
-        registered(), key=lambda check: check.case is not MACHINE
+        registered(),
+        key=lambda check: check.case is not MACHINE,
     )  # the others depend on the machine: it comes first
     about = description()
     results: list[Result] = []

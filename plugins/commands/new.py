@@ -49,7 +49,10 @@ def new() -> None:
     shell_complete=complete.instruments,
 )
 @click.option(
-    "--site", metavar="NAME", shell_complete=complete.sites, help="[default: the telescope's own]"
+    "--site",
+    metavar="NAME",
+    shell_complete=complete.sites,
+    help="[default: the telescope's own]",
 )
 @click.option(
     "--target",
@@ -69,7 +72,8 @@ def pipeline(name: str, instrument: str, site: str | None, target: str | None) -
     path = Path(name if name.endswith((".yaml", ".yml")) else f"{name}.yaml")
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", path.stem):
         raise OutputError(
-            f"{path.stem!r} cannot be the name of a pipeline", cure="use letters, digits, - and _"
+            f"{path.stem!r} cannot be the name of a pipeline",
+            cure="use letters, digits, - and _",
         )
     _check_free(path)
     text = pipeline_text(path, instrument, site, target)
@@ -96,12 +100,16 @@ def plugin(name: str) -> None:
     ):
         cure = "use letters, digits and hyphens, e.g. zonda-mycamera"
         raise OutputError(
-            f"{name!r} cannot be the name of a plugin", place="zonda new plugin", cure=cure
+            f"{name!r} cannot be the name of a plugin",
+            place="zonda new plugin",
+            cure=cure,
         )
     if importlib.util.find_spec(package):
         cure = f"choose another name, e.g. zonda-{name}"
         raise OutputError(
-            f"a Python module {package!r} is installed already", place="zonda new plugin", cure=cure
+            f"a Python module {package!r} is installed already",
+            place="zonda new plugin",
+            cure=cure,
         )
     folder = Path(name)
     _check_free(folder)
@@ -110,7 +118,8 @@ def plugin(name: str) -> None:
     made = {}
     for template in sorted((TEMPLATES / "plugin").rglob("*.tmpl")):
         inside = str(template.relative_to(TEMPLATES / "plugin").with_suffix("")).replace(
-            "package", package
+            "package",
+            package,
         )
         made[inside] = Template(template.read_text(encoding="utf-8")).substitute(values)
     _write_folder(folder, made)
@@ -125,7 +134,9 @@ def _check_free(path: Path) -> None:
         raise OutputError("exists already", place=str(path), cure="choose another name")
     if not path.parent.is_dir():
         raise OutputError(
-            "there is no such folder", place=str(path.parent), cure="make it, or choose another"
+            "there is no such folder",
+            place=str(path.parent),
+            cure="make it, or choose another",
         )
 
 

@@ -72,7 +72,10 @@ def noise(
     def estimate(row: Floats, good: Any, rate: float) -> Any:
         return fit(
             *spectrum(
-                row, good, rate, segment_length(len(row), rate, seconds, f"zonda noise, {file}")
+                row,
+                good,
+                rate,
+                segment_length(len(row), rate, seconds, f"zonda noise, {file}"),
             )
         )
 

@@ -13,7 +13,10 @@ from zonda.core.command_options import set_option
 
 @click.command()
 @click.argument(
-    "pipeline", metavar="[FILE_OR_NAME]", required=False, shell_complete=complete.pipelines
+    "pipeline",
+    metavar="[FILE_OR_NAME]",
+    required=False,
+    shell_complete=complete.pipelines,
 )
 @click.option(
     "--instrument",
@@ -39,7 +42,10 @@ from zonda.core.command_options import set_option
     help="Of the climatology.  [default: the present one]",
 )
 @click.option(
-    "--quantile", type=float, metavar="SHARE", help="Of the PWV in that month, e.g. 0.25."
+    "--quantile",
+    type=float,
+    metavar="SHARE",
+    help="Of the PWV in that month, e.g. 0.25.",
 )
 @click.option(
     "--elevation",
@@ -92,7 +98,10 @@ from zonda.core.command_options import set_option
     help="Simulate the pipeline with N seeds beside the forecast.",
 )
 @click.option(
-    "--threads", type=click.IntRange(min=1), metavar="N", help="Threads of --audit.  [default: all]"
+    "--threads",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Threads of --audit.  [default: all]",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.option(

@@ -67,7 +67,9 @@ _time = click.option(
     help="Whose bands to show; may be repeated.",
 )
 @click.option(
-    "--pwv", metavar="PWV", help="Water: 1.2mm, 25%, or random.  [default: as the source has it]"
+    "--pwv",
+    metavar="PWV",
+    help="Water: 1.2mm, 25%, or random.  [default: as the source has it]",
 )
 @click.option(
     "--file",
@@ -115,7 +117,8 @@ def show(
     if not ELEVATION_MIN <= angle <= ELEVATION_MAX:
         limits = f"{math.degrees(ELEVATION_MIN):g} deg to 90 deg"
         raise click.BadParameter(
-            f"{elevation} is outside the limits, {limits}", param_hint="'--elevation'"
+            f"{elevation} is outside the limits, {limits}",
+            param_hint="'--elevation'",
         )
     cameras = (
         camera

@@ -88,7 +88,12 @@ def plot_year(ax: Any, seen: Seen, year: Sequence[Month]) -> None:
     if seen.known:
         _plot_pwv(ax, 1e3 * seen.pwv_by_month[:, :, 1])
     ax.contourf(
-        hours, place, day.astype(np.float64), levels=[0.5, 1.5], colors="none", hatches=["//"]
+        hours,
+        place,
+        day.astype(np.float64),
+        levels=[0.5, 1.5],
+        colors="none",
+        hatches=["//"],
     )
     limit = math.degrees(seen.night.above)
     low, high = elevation.min(), elevation.max()
@@ -246,7 +251,9 @@ def _name_lines(ax: Any) -> None:
     )
     place = ax.get_xaxis_transform()
     for (frequency, name), at in zip(
-        rows, spread([f for f, _ in rows], NAME, LOWEST / 1e9, HIGHEST / 1e9), strict=True
+        rows,
+        spread([f for f, _ in rows], NAME, LOWEST / 1e9, HIGHEST / 1e9),
+        strict=True,
     ):
         colour = LINE_COLOURS[name]
         stroke = {"color": colour, "lw": 0.6, "clip_on": False, "transform": place}

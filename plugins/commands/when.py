@@ -51,7 +51,10 @@ if TYPE_CHECKING:
     help="Whose transmission to show; may be repeated.",
 )
 @click.option(
-    "--json", "as_json", is_flag=True, help="Print JSON; draw only where --output is given."
+    "--json",
+    "as_json",
+    is_flag=True,
+    help="Print JSON; draw only where --output is given.",
 )
 @click.option(
     "--output",
@@ -81,7 +84,8 @@ def when(
     for part in target:
         if part.startswith("--"):
             raise click.NoSuchOption(
-                part.partition("=")[0], possibilities=["--site"] if site is None else None
+                part.partition("=")[0],
+                possibilities=["--site"] if site is None else None,
             )
     if site is None:
         raise click.MissingParameter(param_hint="'--site'", param_type="option")
@@ -90,7 +94,8 @@ def when(
     limit = checked("--above", lambda: Unit("rad", "30 deg").parse(above))
     if not 0 <= limit < math.pi / 2:
         raise click.BadParameter(
-            f"{above} is outside the limits, 0 deg to 90 deg", param_hint="'--above'"
+            f"{above} is outside the limits, 0 deg to 90 deg",
+            param_hint="'--above'",
         )
     if output is not None:
         check_output_folder(output)

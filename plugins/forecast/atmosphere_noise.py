@@ -310,7 +310,9 @@ def _of_waves(
 
 
 def _rows(
-    survey: Survey, scans: list[_Scan], template: Template
+    survey: Survey,
+    scans: list[_Scan],
+    template: Template,
 ) -> list[tuple[Floats, Floats, AnyFloats]]:
     """For each scan the series of a template, added up over groups of detectors that are near to
     each other; the groups' offsets, and their shares of the detectors.
@@ -414,5 +416,7 @@ def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
     power = stays * spectrum / spectrum.sum() / (frequency[1] - grid[0])
     density = power * o.sample_rate / 2
     return Mode(
-        independent, stays, Noise(1.0, lambda at: np.interp(at, frequency, density, right=0.0))
+        independent,
+        stays,
+        Noise(1.0, lambda at: np.interp(at, frequency, density, right=0.0)),
     )

@@ -128,7 +128,9 @@ def audit(
     """
     if seeds < 2:
         raise InputError(
-            f"{seeds} simulation has no standard error", place="--audit", cure="ask for 2 or more"
+            f"{seeds} simulation has no standard error",
+            place="--audit",
+            cure="ask for 2 or more",
         )
     every = list(dict.fromkeys(p for f in forecasts.values() for p in f.parts("I")))
     first, made = file.scene().seed, list[dict[str, dict[str, MapProduct]]]()

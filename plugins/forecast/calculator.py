@@ -71,7 +71,12 @@ class Calculated:
         """For another time."""
         share = math.sqrt(self.seconds / seconds)
         return Calculated(
-            self.centre * share, self.band * share, seconds, self.pwv, self.elevation, self.diameter
+            self.centre * share,
+            self.band * share,
+            seconds,
+            self.pwv,
+            self.elevation,
+            self.diameter,
         )
 
 
@@ -90,7 +95,10 @@ def calculate(
     """
     frequency, response = band.frequency, band.transmission
     seen = spectrum(
-        layers, math.pi / 2, low=float(frequency[0]) - MARGIN, high=float(frequency[-1]) + MARGIN
+        layers,
+        math.pi / 2,
+        low=float(frequency[0]) - MARGIN,
+        high=float(frequency[-1]) + MARGIN,
     )
     fine = np.linspace(frequency[0], frequency[-1], max(len(frequency), 2001))
     share = np.interp(fine, frequency, response)
@@ -106,7 +114,12 @@ def calculate(
     root = SYSTEM * math.sqrt(POLARIZATIONS * width * seconds)
     centre = float(sefd(np.array([band.centre]))[0])
     return Calculated(
-        centre / root * 1e26, whole / root * 1e26, seconds, layers.pwv, elevation, diameter
+        centre / root * 1e26,
+        whole / root * 1e26,
+        seconds,
+        layers.pwv,
+        elevation,
+        diameter,
     )
 
 

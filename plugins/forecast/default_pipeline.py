@@ -269,7 +269,9 @@ class Day:
         if target.frame == "horizontal":
             cure = "give --elevation, or a position on the sky"
             raise InputError(
-                "a target in azimuth and elevation moves over the sky", place="--target", cure=cure
+                "a target in azimuth and elevation moves over the sky",
+                place="--target",
+                cure=cure,
             )
         start = middle.shifted(-DAY / 2)
         transform = CelestialTransform(site, start, DAY, 1e-6)
@@ -277,7 +279,9 @@ class Day:
         height = transform.horizontal(unit_vectors(*target.icrs()), seconds)[:, 2]
         if height.max() <= 0:
             raise PointingError(
-                f"{target} never rises at {site.name}", place="--target", cure="choose another site"
+                f"{target} never rises at {site.name}",
+                place="--target",
+                cure="choose another site",
             )
         return cls(start, np.arcsin(np.clip(height, -1, 1)))
 

@@ -209,7 +209,9 @@ def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
         for _ in range(max(1, SIGNS // len(chosen))):
             factors, signs = np.zeros(comb.inside.shape), rng.choice([-1.0, 1.0], len(there))
             factors[comb.inside] = np.where(
-                there > 0, signs / np.sqrt(np.where(there > 0, there, 1.0)), 0.0
+                there > 0,
+                signs / np.sqrt(np.where(there > 0, there, 1.0)),
+                0.0,
             )
             draws.append(partial(kernels, survey, comb, factors))
     return draws

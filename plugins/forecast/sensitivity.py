@@ -107,7 +107,10 @@ def _forecast(
     depth = planes.pop("I")
     end = float(depth.seconds[-1])
     seconds = default_pipeline.positive(
-        "--integration", Unit("s", "3 h"), asked.get("integration"), end
+        "--integration",
+        Unit("s", "3 h"),
+        asked.get("integration"),
+        end,
     )
     seen = None
     if placed is not None:

@@ -160,7 +160,9 @@ class Source(NamedTuple):
                 source = found.read_input()
             except InputError as err:
                 raise InputError(
-                    err.message, place=f"{PLACE} {self.text}", cure=err.cure or ""
+                    err.message,
+                    place=f"{PLACE} {self.text}",
+                    cure=err.cure or "",
                 ) from None
             if isinstance(source, ImageMap) and source.placeless:
                 wrong = "it has no world coordinates: where it lies is not known"
@@ -239,7 +241,9 @@ class Seen:
         """
         if of not in OF:
             raise InputError(
-                f"no S/N of {of!r}", place="sensitivity", cure=f"choose: {', '.join(OF)}"
+                f"no S/N of {of!r}",
+                place="sensitivity",
+                cure=f"choose: {', '.join(OF)}",
             )
         if of == "peak":
             return np.asarray(abs(self.left(seconds)) / depth.total(seconds))

@@ -498,7 +498,9 @@ def _alive(observation: Observation) -> Observation:
 def _check_scans(observations: Sequence[Observation], name: str) -> None:
     if not observations:
         raise PipelineError(
-            "the pointing steps made no observation", place=name, cure="ask for at least one scan"
+            "the pointing steps made no observation",
+            place=name,
+            cure="ask for at least one scan",
         )
     first = observations[0].focalplane.names
     for o in observations:

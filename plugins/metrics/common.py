@@ -96,7 +96,9 @@ def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Flo
     own = wcs_grid(image.wcs, (image.values.shape[0], image.values.shape[1]))
     width = product.fwhm if fwhm is None else fwhm
     smooth, _ = smoothed(
-        own, np.nan_to_num(image.values), math.sqrt(max(width**2 - image.fwhm**2, 0.0))
+        own,
+        np.nan_to_num(image.values),
+        math.sqrt(max(width**2 - image.fwhm**2, 0.0)),
     )
     grid = product.grid
     x, y = own.coordinates(grid.directions() @ grid.turn @ own.turn.T)  # either may be galactic
@@ -144,7 +146,9 @@ def needs_tan(kind: str, metric: str) -> None:
     """PipelineError about ``metric`` for a map that is not TAN."""
     if kind != "TAN":
         raise PipelineError(
-            f"{metric} needs a TAN map", place=metric, cure="leave BinMap.nside and projection out"
+            f"{metric} needs a TAN map",
+            place=metric,
+            cure="leave BinMap.nside and projection out",
         )
 
 

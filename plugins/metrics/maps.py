@@ -100,7 +100,9 @@ class Fidelity(FigureMetric):
         peak = float(np.nanmax(size, initial=0.0))
         if peak == 0:
             raise InputError(
-                "the reference is empty", place="fidelity", cure="compare with a sky with a source"
+                "the reference is empty",
+                place="fidelity",
+                cure="compare with a sky with a source",
             )
         return float(np.median(found.planes["fidelity"][size >= self.least * peak])), math.nan
 
@@ -143,7 +145,11 @@ class MapPower(FigureMetric):
         are missing.
         """
         found = product_of(
-            data, self.spectra, MapSpectra, "map_power", "product of map spectra, MapSpectrum"
+            data,
+            self.spectra,
+            MapSpectra,
+            "map_power",
+            "product of map spectra, MapSpectrum",
         )
         rings = found.spectra
         if self.of not in rings.power or self.of not in rings.white:

@@ -100,7 +100,9 @@ def p_value(stream: Floats, rate: float, above: float | None, every: int) -> flo
     if half < LEAST or not np.ptp(values) > 0:
         cure = "lengthen the scan, or make `every` smaller; the stream must not be constant"
         raise InputError(
-            f"the halves of the stream have {half} samples", place="anderson_darling", cure=cure
+            f"the halves of the stream have {half} samples",
+            place="anderson_darling",
+            cure=cure,
         )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that p lies beyond the table

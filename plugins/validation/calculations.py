@@ -66,7 +66,8 @@ class Amount(TextValue):
         except ValueError:
             known = ", ".join(filter(None, FURTHER))
             raise mistake(
-                f"unknown unit '{unit}'", help=f"a unit that astropy reads, or one of: {known}"
+                f"unknown unit '{unit}'",
+                help=f"a unit that astropy reads, or one of: {known}",
             ) from None
         return cls(float(match[1]) * factor, unit, factor)
 
@@ -190,7 +191,9 @@ def disc_overlap(
     apart.
     """
     x = beam_shift(aperture, frequency, distance, factor) / beam_width(
-        aperture, frequency, distance
+        aperture,
+        frequency,
+        distance,
     )
     return (2 / math.pi) * (math.acos(x) - x * math.sqrt(1 - x * x)) if x < 1 else 0.0
 

@@ -81,7 +81,8 @@ class Stated:
             "at_most": mean - self.value,
         }[self.relation]
         return max(
-            0.0, away - self.rounding - 1e-9 * abs(self.value)
+            0.0,
+            away - self.rounding - 1e-9 * abs(self.value),
         )  # a limit itself is inside, whatever its last bit
 
 
@@ -407,12 +408,15 @@ def read(path: Path = SHIPPED) -> ClaimsFile:
     """
     document = yaml_places.load(Source(str(path), read_text(path)))
     found = Mistakes(
-        document, path.parent, [Diagnostic(f.message, f.span, f.label) for f in document.faults]
+        document,
+        path.parent,
+        [Diagnostic(f.message, f.span, f.label) for f in document.faults],
     )
     file = None
     if not isinstance(document.value, dict):
         found.wrong(
-            "a claims file is a mapping of the keys paper and claims", Span(Source(str(path), ""))
+            "a claims file is a mapping of the keys paper and claims",
+            Span(Source(str(path), "")),
         )
     else:
         tree = {k: v for k, v in document.value.items() if not str(k).startswith("x-")}

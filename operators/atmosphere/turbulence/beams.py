@@ -98,7 +98,8 @@ class Aperture:
         t = np.exp(np.arange(-7.0, 3.6, 1.0))
         w = t**1.5 * np.exp(-t)
         return np.asarray(2 / 3 * self.moments[0] * t, np.float64), np.asarray(
-            w / w.sum(), np.float64
+            w / w.sum(),
+            np.float64,
         )
 
     def structure(self, r: ArrayLike, outer_scale: float) -> Floats:

@@ -160,7 +160,8 @@ class Cone:
             - np.arcsinh(1 / np.tan(self.elevation))
         )
         return np.asarray(q, np.float64), np.asarray(
-            np.arctan2(y, x) / np.sin(self.elevation), np.float64
+            np.arctan2(y, x) / np.sin(self.elevation),
+            np.float64,
         )
 
     def unroll(self, crossings: Floats) -> Floats:

@@ -301,7 +301,11 @@ def _convolve(noise, kernels, out):  # type: ignore[no-untyped-def]
             row = rows[radius + 1 - size :]
             for b in range(0, number - 1, 2):
                 _add_two_symmetric(
-                    row, kernels[b, di, :size], kernels[b + 1, di, :size], out[b, i], out[b + 1, i]
+                    row,
+                    kernels[b, di, :size],
+                    kernels[b + 1, di, :size],
+                    out[b, i],
+                    out[b + 1, i],
                 )
             if number % 2:
                 _add_symmetric(row, kernels[number - 1, di, :size], out[number - 1, i])

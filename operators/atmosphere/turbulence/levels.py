@@ -130,7 +130,10 @@ def aperture_levels(
             s, w = mixture_between(outer_scale, 0.0, low, high)
             e = np.concatenate([s + square for _, square in aperture.gaussians])
             kernel = _separable_kernel(
-                e, np.concatenate([c * w for c, _ in aperture.gaussians]), spacing, f.radius
+                e,
+                np.concatenate([c * w for c, _ in aperture.gaussians]),
+                spacing,
+                f.radius,
             )
             low = high
         levels.append(Level(exponent, kernel))

@@ -87,7 +87,8 @@ class LinesOfSight:
         self._cone = plane.cone
         if plane.cone is None:
             rows = np.concatenate(
-                [np.einsum("ab,nbc->nac", plane.matrix, linear[:, :2]), linear[:, 2:]], axis=1
+                [np.einsum("ab,nbc->nac", plane.matrix, linear[:, :2]), linear[:, 2:]],
+                axis=1,
             )
             self._shift = plane.matrix @ plane.centre
             self._turn = np.zeros((2, 0))
@@ -193,7 +194,8 @@ def _about_the_boresight(linear: Floats, cone: Cone) -> tuple[Floats, Floats]:
     rows[:, 2] = linear[:, 2]
     one, two = cone.axis
     azimuth = np.arctan2(
-        one * ahead[:, 1] - two * ahead[:, 0], one * ahead[:, 0] + two * ahead[:, 1]
+        one * ahead[:, 1] - two * ahead[:, 0],
+        one * ahead[:, 0] + two * ahead[:, 1],
     )
     turn = azimuth / math.sin(cone.elevation)
     c, s = np.cos(turn), np.sin(turn)

@@ -267,7 +267,11 @@ def choose_nodes(
     ):  # small grids cost little, and serve most often
         reach *= 2
     place = bisect_left(
-        sizes, True, reach // 2, min(reach, len(sizes)), key=lambda size: error(size) <= tolerance
+        sizes,
+        True,
+        reach // 2,
+        min(reach, len(sizes)),
+        key=lambda size: error(size) <= tolerance,
     )
     if place == len(sizes):
         return (
@@ -336,7 +340,9 @@ def layer_time_error(layer: Layer, speeds: Floats, delta: float, dt: float) -> f
 def times_with_margin(n_samples: int, step: int) -> NDArray[np.int64]:
     """Samples at which `SmoothField.from_values` wants its values."""
     return step * np.arange(
-        -PAD - SPLINE_MARGIN, -(-n_samples // step) + 2 + SPLINE_MARGIN, dtype=np.int64
+        -PAD - SPLINE_MARGIN,
+        -(-n_samples // step) + 2 + SPLINE_MARGIN,
+        dtype=np.int64,
     )
 
 

@@ -206,7 +206,10 @@ class DriftingLayers:
                     if layer.step == own:
                         matrix, i, j = self._places[n]
                         a, b, c, d = extent(
-                            matrix, boxes, i[start : start + count], j[start : start + count]
+                            matrix,
+                            boxes,
+                            i[start : start + count],
+                            j[start : start + count],
                         )
                         cells[n] += points_of((a, b, c, d))
                         k, m, p, q = whole[n]
@@ -315,7 +318,10 @@ def share_tiles(bands: Sequence[DriftingLayers]) -> list[Counter[int]]:
                     swept = joined
                     here.append(other)
             tiling = Tiling(
-                tiles, number, {k: bands[k]._drifting[layer].field for k in here}, swept
+                tiles,
+                number,
+                {k: bands[k]._drifting[layer].field for k in here},
+                swept,
             )
             for k in here:
                 bands[k]._band, bands[k]._tilings[layer] = k, tiling

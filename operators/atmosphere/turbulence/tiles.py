@@ -140,7 +140,11 @@ class Tiles:
             a, b, c, d = box
             parts = iter(
                 coefficients(
-                    [one for some in fields.values() for one in some], a, b + APRON, c, d + APRON
+                    [one for some in fields.values() for one in some],
+                    a,
+                    b + APRON,
+                    c,
+                    d + APRON,
                 )
             )
             tiles = {bands: _alternating([next(parts) for _ in bands]) for bands in fields}
@@ -240,7 +244,8 @@ class Tiling:
             sides = _WHOLE, slab[2]
         first_i, first_j = low_i >> sides[0], low_j >> sides[1]
         wanted = np.zeros(
-            ((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1), np.uint8
+            ((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1),
+            np.uint8,
         )
         mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
         begin, across = first_i << sides[0], 1 << sides[0]

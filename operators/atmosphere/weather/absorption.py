@@ -102,7 +102,8 @@ class AbsorptionTable:
                 cure=f"keep the band within {limits}",
             )
         return slice(
-            int(np.searchsorted(edges, low, "right")) - 1, int(np.searchsorted(edges, high, "left"))
+            int(np.searchsorted(edges, low, "right")) - 1,
+            int(np.searchsorted(edges, high, "left")),
         )
 
     def cross_sections(
@@ -156,7 +157,9 @@ class AbsorptionTable:
                 f" {limit:.5g} hPa"
             )
         below = np.clip(
-            np.searchsorted(grid, x) - 1, 0, len(grid) - 2
+            np.searchsorted(grid, x) - 1,
+            0,
+            len(grid) - 2,
         )  # the first and last step also serve the margins
         # Air thinner than the table's 0.13 hPa has the cross-sections of its edge; a `Profile` has
         # none, it ends at 0.75 hPa.

@@ -88,7 +88,8 @@ class BandAtmosphere:
         check_pwv(self.pwv_max)
         if self.pwv_max == 0:
             raise InputError(
-                "the profile is dry, so there is no vapour to vary", cure="give a PWV above 0 mm"
+                "the profile is dry, so there is no vapour to vary",
+                cure="give a PWV above 0 mm",
             )
         self.transfer = BandTransfer(band, replace(profile.layers, spectra=spectra))
         self._v_max = -math.log(math.sin(ELEVATION_MIN))

@@ -78,7 +78,8 @@ class Era5(WeatherSource):
                 if wrong.any():
                     level = found.pressure[int(np.argmax(wrong))] / 100
                     raise InputError(
-                        f"its level of {level:g} hPa: {text}: no air has that", cure=UNITS
+                        f"its level of {level:g} hPa: {text}: no air has that",
+                        cure=UNITS,
                     )
         return found
 
@@ -102,7 +103,10 @@ class Era5(WeatherSource):
         }
         if abs(latitude) <= 89.9:
             weights["lon"] = _weights(
-                "longitudes", away, 0.0, say=lambda x: f"{x + longitude:.2f} deg"
+                "longitudes",
+                away,
+                0.0,
+                say=lambda x: f"{x + longitude:.2f} deg",
             )
         order = np.argsort(-pressure)
 
@@ -116,7 +120,8 @@ class Era5(WeatherSource):
             h2o = from_relative(h2o, pressure, temperature)
         else:
             raise InputError(
-                f"its relative humidity is up to {h2o.max():.3g}: no air has that", cure=UNITS
+                f"its relative humidity is up to {h2o.max():.3g}: no air has that",
+                cure=UNITS,
             )
         o3 = column("o3") if "o3" in file else None
         # ERA5's packing and spectral transform leave slightly negative water and ozone.
@@ -252,5 +257,7 @@ def retrieve(site: Site, time: Instant, hours: int, path: Path) -> None:
     ) as err:  # cdsapi raises bare Exceptions: no key, no licence accepted, no network
         text = str(err).strip().splitlines()[0] if str(err).strip() else type(err).__name__
         raise InputError(
-            f"the Climate Data Store did not deliver: {text}", place="zonda weather fetch", cure=KEY
+            f"the Climate Data Store did not deliver: {text}",
+            place="zonda weather fetch",
+            cure=KEY,
         ) from None

@@ -169,7 +169,8 @@ class NetCdf:
             unit = self.text(found[kind].name, "units")
             if unit and not unit.startswith("deg"):
                 raise InputError(
-                    f"its {found[kind].name} has the unit '{unit}'", cure="expected degrees"
+                    f"its {found[kind].name} has the unit '{unit}'",
+                    cure="expected degrees",
                 )
         level = found["level"]
         plainly_pa = level.values.size and np.nanmax(level.values) > 2000  # surface: 300-1100 hPa
@@ -255,7 +256,9 @@ class NetCdf:
             known = SPELLED.get(written.lower(), written or default)
             unit = read_unit(known) if isinstance(known, str) else known
             zero, one = unit.to(
-                read_unit(si), np.array([0.0, 1.0]), equivalencies=[*u.temperature(), *HEIGHTS]
+                read_unit(si),
+                np.array([0.0, 1.0]),
+                equivalencies=[*u.temperature(), *HEIGHTS],
             ).tolist()
         except ValueError:
             raise InputError(
@@ -273,7 +276,8 @@ class NetCdf:
         found = self._found(names, standard)
         if found is None:
             raise InputError(
-                f"has no axis {' or '.join(names)}", cure=f"it must be on pressure levels: {GET}"
+                f"has no axis {' or '.join(names)}",
+                cure=f"it must be on pressure levels: {GET}",
             )
         dims = self._variables[found].dims
         values = (convert or self.values)(found)

@@ -276,7 +276,9 @@ def on_heights(column: Column, site: Site) -> Profile:
         linear(np.log(np.maximum(column.h2o, 1e-12)))
     )  # a logarithm of dry air: 6e-9 mm of water in the whole column
     mean = np.where(
-        above > 0, (temperature + top) / 2, temperature
+        above > 0,
+        (temperature + top) / 2,
+        temperature,
     )  # of the air between the outermost level and z
     log_pressure = linear(np.log(column.pressure)) - GRAVITY * (above + below) / (
         DRY_AIR_GAS_CONSTANT * mean
@@ -306,7 +308,8 @@ def on_heights(column: Column, site: Site) -> Profile:
     low, high = (replace(made, h2o=made.h2o * np.exp(sign * wide)).pwv for sign in (-1, 1))
     stacked, shares = math.log(high / low) / 2, column.column_spread or (STACKING, STACKING)
     return replace(
-        made, distribution=PwvDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked)
+        made,
+        distribution=PwvDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked),
     )
 
 

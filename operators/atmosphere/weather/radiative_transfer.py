@@ -238,7 +238,8 @@ def emission(slant_opacity: Floats, source: Floats) -> Floats:
         (n + 1, ...) J at the boundaries, K.
     """
     opacity = np.maximum(
-        slant_opacity, np.finfo(np.float64).tiny
+        slant_opacity,
+        np.finfo(np.float64).tiny,
     )  # so that (1 - e^-t) / t is 1 where t is 0
     absorbed = np.expm1(-opacity)
     np.negative(absorbed, out=absorbed)

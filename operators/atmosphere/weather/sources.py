@@ -239,7 +239,8 @@ def profile_of(
     profile, how = _scaled(on_heights(weather.column(site, time), site), weather, seed)
     profile, wind = _blown(profile, weather, seed)
     return replace(
-        profile, stated=(*profile.stated, ("PWV", how), *_supersaturated(profile), ("wind", wind))
+        profile,
+        stated=(*profile.stated, ("PWV", how), *_supersaturated(profile), ("wind", wind)),
     )
 
 

@@ -47,7 +47,8 @@ def pwv_by_month(site: Site, year: int = 2023) -> PwvByMonth:
     for month in range(12):
         for k, hour in enumerate(HOURS):
             law = climatology.profile(
-                site, Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z")
+                site,
+                Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z"),
             ).distribution
             assert law is not None  # the climatology has spreads
             median[month, k] = law.median

@@ -428,7 +428,11 @@ def plane_of(
     """
     if isinstance(product, Image):
         return Plane(
-            name, np.asarray(product.values, np.float64), product.header, product.unit, product.fwhm
+            name,
+            np.asarray(product.values, np.float64),
+            product.header,
+            product.unit,
+            product.fwhm,
         )
     noise: Floats | None = product.noise
     if not np.isfinite(product.noise).any():

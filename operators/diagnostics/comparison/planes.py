@@ -298,7 +298,10 @@ def _of_neighbours(plane: Plane, target: MapGrid) -> tuple[Floats, Floats | None
         return np.where(there, plane.values[own], np.nan), noise
     lon, lat = angles(directions)
     near, weights = healpy.get_interp_weights(
-        source.nside, np.pi / 2 - lat.ravel(), lon.ravel(), nest=source.nest
+        source.nside,
+        np.pi / 2 - lat.ravel(),
+        lon.ravel(),
+        nest=source.nest,
     )
     place = np.clip(np.searchsorted(source.pixels, near), 0, len(source.pixels) - 1)
     known = (source.pixels[place] == near) & np.isfinite(plane.values[place])

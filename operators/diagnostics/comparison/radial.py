@@ -343,7 +343,9 @@ def profiles(
             first = np.bincount(ring, weight * values[known]) / covered
             second = np.bincount(ring, weight * (values[known] - first[ring]) ** 2) / covered
             error[name] = np.where(
-                independent > 1, np.sqrt(second / np.maximum(independent - 1, 1e-9)), np.nan
+                independent > 1,
+                np.sqrt(second / np.maximum(independent - 1, 1e-9)),
+                np.nan,
             )
         mean[name] = first
     return Profiles(np.asarray((np.arange(len(number)) + 0.5) * width, np.float64), mean, error)

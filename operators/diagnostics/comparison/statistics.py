@@ -130,7 +130,9 @@ def compare(
         for name, plane, of in (("snr", b, "map"), ("reference_snr", a, "reference")):
             if plane.noise is not None and np.isfinite(plane.noise[both]).any():
                 planes[name] = np.where(
-                    both & (plane.noise > 0), plane.values / plane.noise, np.nan
+                    both & (plane.noise > 0),
+                    plane.values / plane.noise,
+                    np.nan,
                 )
                 noise[name] = plane.noise_in_words, plane.factor
                 notes.append(f"noise of the {of}: {plane.noise_in_words}")

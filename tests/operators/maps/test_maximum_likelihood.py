@@ -14,7 +14,8 @@ from zonda.core.errors import PipelineError
 from zonda.core.polarization import PolarizationAngles
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import Looking
-from zonda.operators.maps.maximum_likelihood import CompressedScans, MaximumLikelihoodMap
+from zonda.operators.maps.maximum_likelihood import MaximumLikelihoodMap
+from zonda.operators.maps.normal_equations import CompressedScans
 from zonda.plugins.checks.scenes import run, scan, scene
 
 SIGMA = 1e-3
