@@ -114,7 +114,7 @@ def test_damage_at_random_places(name: str, seed: int, how: str) -> None:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["fits", "hdf5", "text"])
-@many(10_000)
+@many(2_000)
 @given(seed=st.integers(0, 2**32), how=st.sampled_from(HOW))
 def test_damage_at_many_places(name: str, seed: int, how: str) -> None:
     damage(name, seed, how)
