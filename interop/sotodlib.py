@@ -8,42 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.flags import (
-    DETECTOR_MASK,
-    INVALID,
-    IRREGULAR,
-    PROCESSING,
-    SAMPLE_MASK,
-    SUN_CLOSE,
-    SUN_UP,
-    TURNAROUND,
-    samples_in,
-)
+from zonda.core.flags import DETECTOR_MASK, SAMPLE_MASK, TURNAROUND, samples_in
 from zonda.core.numerics.earth_orientation import orientation
 from zonda.core.types import Floats
 from zonda.core.versions import needed
+from zonda.operators.io.axismanager import SAMPLES, SCANS, UNION
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 from .scans import Scan, Source, scan_of
 
 EXTRA = "sotodlib"
 
-FLAGS = {
-    "invalid": INVALID,
-    "processing": PROCESSING,
-    "irregular": IRREGULAR,
-    "sun_up": SUN_UP,
-    "sun_close": SUN_CLOSE,
-}
-"""Flags of samples by their names in the AxisManager, of all detectors; the turnarounds are one for
-all (`_scans`).
-"""
 CALIBRATION = {"phase_to_pW": 1.0, "polarity": 1, "r_tes": 0.004, "r_n": 0.008, "r_frac": 0.5}
 """Calibration of every detector: factors that leave the signal in K_RJ, and stand-ins for the
 resistances [ohm] of a detector that is biased well, which zonda does not simulate.
 """
-SCANS = {"left_scan": "rightleft", "right_scan": "leftright"}
-"""Names of sotodlib: to the left is towards smaller azimuth; ends of the intervals' names."""
 
 
 def to_axismanager(
@@ -61,10 +40,10 @@ def to_axismanager(
     - ``boresight_equ`` (samps,): ra, dec, psi, ICRS, zonda's own pointing, which maps of sotodlib
       use where it is there.
     - ``focal_plane`` (dets,): xi, eta (sines, not zonda's tangents) and gamma.
-    - ``flags``, a FlagManager of RangesMatrix (dets, samps): those of `FLAGS`; ``detectors``, whole
-      rows; ``samples``, single samples that are not finite or flagged in the file; ``excluded``,
-      all that no map uses. ``turnarounds``, ``left_scan`` and ``right_scan`` are Ranges (samps,);
-      the last two where there are throws.
+    - ``flags``, a FlagManager of RangesMatrix (dets, samps): those of `axismanager.SAMPLES`;
+      ``detectors``, whole rows; ``samples``, single samples that are not finite or flagged in the
+      file; ``excluded``, all that no map uses. ``turnarounds``, ``left_scan`` and ``right_scan``
+      are Ranges (samps,); the last two where there are throws.
     - ``det_info`` (dets,): name, readout_id, det_id, band, wafer_slot; wafer.bandpass, array, type.
     - ``det_cal`` (dets,): bg, the wafer's number, -1 for detectors that no map uses; bandpass;
       those of `CALIBRATION`.
@@ -241,9 +220,11 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
         ranges = so3g.Ranges.from_mask(where)
         return so3g.RangesMatrix([ranges.copy() for _ in tod.names])
 
-    for name, bit in FLAGS.items():
-        flags.wrap_dets_samps(name, of_samples((tod.flags & np.uint8(bit)) != 0))
-    for name, where in _scans(tod).items():
+    scans = _scans(tod)
+    for name, bit in SAMPLES.items():
+        if name not in scans:
+            flags.wrap_dets_samps(name, of_samples((tod.flags & np.uint8(bit)) != 0))
+    for name, where in scans.items():
         flags.wrap(name, so3g.Ranges.from_mask(where), [(0, "samps")])
     dead = (tod.detector_flags & np.uint8(DETECTOR_MASK)) != 0
     flags.wrap_dets("detectors", dead)
@@ -254,7 +235,7 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
     excluded = (
         of_samples((tod.flags & np.uint8(SAMPLE_MASK)) != 0) + flags.detectors + flags.samples
     )
-    flags.wrap_dets_samps("excluded", excluded)
+    flags.wrap_dets_samps(UNION, excluded)
     return flags
 
 

@@ -43,18 +43,19 @@ STREAMS = ("ndarray", "quantity", "flacarray")
 """How streams may be written."""
 SAMPLES = {
     "turnarounds": TURNAROUND,
+    "invalid": INVALID,
     "processing": PROCESSING,
     "irregular": IRREGULAR,
     "sun_up": SUN_UP,
     "sun_close": SUN_CLOSE,
 }
-"""Bits of flags of all detectors by name; of any other it is `INVALID`."""
+"""Bits of the flags of samples by name; any other flag is `INVALID`."""
 SOURCES = ("source_flags", "source_moon")
 """Flags of samples that see a source: `SOLAR_SYSTEM_OBJECT`."""
 SCANS = {"left_scan": "rightleft", "right_scan": "leftright"}
-"""Flags that are intervals, and the ends of their names: to the left is towards smaller azimuth."""
+"""Flags that are intervals here, with the ends of their names; left is towards smaller azimuth."""
 UNION = "excluded"
-"""The union of others in what `to_axismanager` makes."""
+"""Flag of `to_axismanager`: the union of its others."""
 SITES = {
     "lat": (-22.960963888888887, -67.78768888888888),
     "sat1": (-22.960105555555554, -67.78836388888888),
@@ -75,7 +76,7 @@ def holds_axismanager(path: str | os.PathLike[str]) -> bool:
     try:
         with h5py.File(path, "r") as file:
             return SCHEMA in _root(file).attrs
-    except Exception:  # of a damaged file, which TOAST's reader tells
+    except Exception:  # a damaged file: TOAST's reader reports it
         return False
 
 
@@ -214,7 +215,7 @@ def _centres(info: Fields, n: int) -> Floats | None:
 def _site(about: Mapping[str, Any]) -> tuple[str, float, float, float]:
     """Name, latitude, longitude [rad] and altitude [m] of the telescope.
 
-    Raises InputError where they are not stated, nor the telescope is of the Simons Observatory.
+    Raises InputError if they are not stated and the telescope is none of the Simons Observatory's.
     """
     if {"latitude", "longitude", "altitude"} <= about.keys():
         latitude, longitude = float(about["latitude"]), float(about["longitude"])
@@ -230,8 +231,8 @@ def _site(about: Mapping[str, Any]) -> tuple[str, float, float, float]:
 
 
 def _take_flags(tod: TimeOrderedData, child: Fields) -> list[Flag]:
-    """Take flags into those of samples and whole detectors of a scan, and into its intervals; those
-    that are left, of samples of single detectors.
+    """Put the file's flags into those of samples and of whole detectors of a scan, and into its
+    intervals; return the flags of single detectors' samples.
     """
     n, found = tod.n_samples, list[Flag]()
     for name in sorted(child.schema, key=lambda name: name != "turnarounds"):
@@ -265,7 +266,7 @@ class Fields:
     Attributes
     ----------
     schema, units
-        What it says of each field. A child that is not there has none.
+        What the file states of each field; empty for a child that is not there.
     """
 
     def __init__(self, group: Any, place: str) -> None:
