@@ -33,7 +33,7 @@ from .recorded_scan import (
     rows_of_bands,
     site_of,
 )
-from .recorded_stream import RecordedStream, check_unit, kelvin_per, scale_of
+from .recorded_stream import RecordedStream, check_unit, kelvin_per
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 from .toast_noise import DEFAULT_MODEL
@@ -160,7 +160,7 @@ class RecordedFiles(Operator):
     @field_validator("unit")
     @classmethod
     def _of_temperature(cls, unit: str | None) -> str | None:
-        if unit is not None and kelvin_per(scale_of(unit)[0]) is None:
+        if unit is not None and kelvin_per(unit) is None:
             raise ValueError("give a unit of temperature: K_RJ, mK_RJ, uK_CMB, ...")
         return unit
 

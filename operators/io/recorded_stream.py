@@ -27,6 +27,9 @@ it has been filtered.
 LARGEST = 1e9
 """K: what is larger is no temperature, but damage."""
 
+CMB = "_CMB"
+"""Ends units of temperature of the CMB."""
+
 STRETCHES, LENGTH = 5, 64
 """Parts of a scan, and samples of each, of which a detector's level is the median."""
 
@@ -177,19 +180,16 @@ def levels(stream: RecordedStream, n_detectors: int, n_samples: int) -> tuple[Fl
 
 
 def kelvin_per(unit: str) -> float | None:
-    """Kelvin per unit of a temperature; None: of another quantity."""
-    return factor_to("K", unit.replace("K_RJ", "K")) if unit.strip() else None
-
-
-def scale_of(unit: str) -> tuple[str, bool]:
-    """A unit without its scale of temperature; True if that is the CMB's: mK, True of mK_CMB."""
-    name, _, scale = unit.strip().rpartition("_")
-    return (name, scale == "CMB") if scale in ("CMB", "RJ") else (unit, False)
+    """Kelvin per unit of a temperature (mK_RJ, K_CMB, ...), on its own scale; None: of another
+    quantity.
+    """
+    plain = unit.strip().removesuffix(CMB).removesuffix("_RJ")
+    return factor_to("K", plain) if plain else None
 
 
 def check_unit(unit: str, name: str, place: str) -> None:
     """Raise InputError for a stream in a unit that is none of temperature."""
-    if kelvin_per(scale_of(unit)[0]) is None:
+    if kelvin_per(unit) is None:
         cure = "calibrate it to a temperature; state its unit, e.g. LoadTOD: {unit: K_CMB}"
         has = f"is in {unit!r}, not in kelvin" if unit else "has no unit"
         raise InputError(f"the stream {name} {has}", place=place, cure=cure)
@@ -197,10 +197,11 @@ def check_unit(unit: str, name: str, place: str) -> None:
 
 def _kelvin(unit: str, name: str, place: str, band: Band | None) -> float:
     """Kelvin (Rayleigh-Jeans) per unit of a stream."""
-    plain, of_cmb = scale_of(unit)
     check_unit(unit, name, place)
-    if of_cmb and band is None:
+    factor = kelvin_per(unit) or 1.0
+    if not unit.strip().endswith(CMB):
+        return factor
+    if band is None:
         cure = "convert it with LoadTOD, which knows the band, and SaveTOD"
         raise InputError(f"the stream {name} is in {unit}", place=place, cure=cure)
-    found = kelvin_per(plain) or 1.0
-    return found * to_kelvin_rj("K_CMB", band) if of_cmb and band is not None else found
+    return factor * to_kelvin_rj("K_CMB", band)
