@@ -399,7 +399,7 @@ class ConvolvedSky(SkyInput):
             for observation in whole.of_each_band():
                 grid = self.grid_of(observation)
                 found = conversion(grid, observation.instrument.band, self.spectral_index)
-                if (text := f"{GAS}: {grid.source.notes.get(GAS)}") not in lines and self.te:
+                if (gas := grid.source.notes.get(GAS)) and (text := f"{GAS}: {gas}") not in lines:
                     lines.append(text)
                 check_brightness(
                     np.abs(grid.source.values).max(initial=0.0, keepdims=True)

@@ -446,9 +446,9 @@ class HealpixMap(InputMap):
     def has_pixels_of(self, other: InputMap) -> bool:
         if not isinstance(other, HealpixMap):
             return False
-        own, others = ((m.nside, m.nest, m.frame, m.pixels is None) for m in (self, other))
-        listed = (np.zeros(0) if m.pixels is None else m.pixels for m in (self, other))
-        return own == others and np.array_equal(next(listed), next(listed))
+        own, others = ((m.nside, m.nest, m.frame) for m in (self, other))
+        listed: Any = self.pixels, other.pixels  # None: all of them
+        return own == others and np.array_equal(*listed)
 
     @property
     def kind(self) -> str:

@@ -149,10 +149,9 @@ def spoil_fits(path: Path, rng: random.Random) -> str:
         hdu.header[key] = made
         what = f"{hdu.name}: {key} = {made!r}"
     raw = b""
-    for number, each in enumerate(hdus):  # as it stands: astropy would mend a header
+    for each in hdus:  # as it stands: astropy would mend a header
         data = b"" if each.data is None else each.data.tobytes()
         raw += each.header.tostring().encode() + data + bytes(-len(data) % 2880)
-        del number
     path.write_bytes(raw)
     return what
 
