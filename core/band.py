@@ -120,7 +120,7 @@ class Band(Parameters):
 GIGAHERTZ_MIN, GIGAHERTZ_MAX = 0.5, 1e5
 """Beyond, a column that was meant to be in GHz is in THz, or in Hz."""
 NEGATIVE_MAX = 0.1
-"""Largest negative transmission that is noise of a measurement, of the peak."""
+"""Largest negative transmission, of the peak, that is taken as noise of a measurement."""
 ALIASES = {
     "frequency": ("frequency", "freq", "f", "nu", "bandpass_frequency", "frequencies", "freqs"),
     "transmission": (
@@ -179,7 +179,7 @@ def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 
 def with_yield(base: type[Parameters], default: float | None) -> Any:
-    """A subclass of ``base`` with the field ``yield``, which is no name in a class statement."""
+    """Subclass of ``base`` with the field ``yield``, a keyword that no class statement can name."""
     text = "Share of the detectors that give data. The others are dead, the same ones in each run."
     field = Field(default, gt=0, le=1, description=text)
     kind: Any = Fraction if default is not None else Fraction | None

@@ -1,4 +1,4 @@
-"""Focal planes in files of others, as tables of detectors: HDF5 of TOAST (`Focalplane.save_hdf5`,
+"""Tables of detectors from focal planes of other packages: HDF5 of TOAST (`Focalplane.save_hdf5`,
 or a whole observation) and TOML of sotodlib and s4sim (`Hardware.dump`).
 
 Both give each detector a quaternion, from the boresight's frame to the detector's. Their NETs are
@@ -67,14 +67,14 @@ OF_HARDWARE = {
 STEEPEST = 3.0
 """Largest slope of pink noise."""
 NO_ROTATION = 1e-6
-"""Least difference of a quaternion's square from 1 for which it is none."""
+"""Difference of a quaternion's square from 1 above which it is no rotation."""
 
 
 def read_detectors(path: Path) -> tuple[Table, list[str]] | None:
     """The detectors of a file of TOAST or sotodlib, and notes; None: it is neither.
 
     Raises InputError for a file that cannot be read, and for a detector without a direction or with
-    a number that is none.
+    a value that is no number.
     """
     place = str(path)
     with reading(place, "a table", AS_TEXT):
@@ -181,8 +181,8 @@ def _table(place: str, columns: dict[str, Any]) -> tuple[Table, list[str]]:
 
 
 def _check(place: str, names: list[str], numbers: Mapping[str, Any]) -> None:
-    """Raise InputError for no detectors, a number that is none, or a quaternion that is no rotation
-    of less than 90 deg.
+    """Raise InputError for no detectors, a value that is no number, or a quaternion that is no
+    rotation of less than 90 deg.
     """
     cure = "mend the detector, or leave it out"
     if not names:

@@ -83,8 +83,8 @@ OTHER_NETS = {
     "Jy": ("a flux density", "write 1222 K NEFD / mJy / (GHz^2 arcsec^2): band's centre, FWHM"),
     "CMB": ("the CMB's temperature", "times x^2 e^x / (e^x - 1)^2, x = GHz / 56.79 of the band"),
 }
-"""Quantities that noise levels in other units are of, and their conversion, by a part of the unit's
-name."""
+"""Noise levels in units of other quantities: the quantity and its conversion, by a part of the
+unit."""
 
 _NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*$", re.DOTALL)
 _LARGE_POWER = re.compile(r"\d{3}")

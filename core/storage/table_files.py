@@ -36,7 +36,7 @@ AS_TEXT = (
     " brackets"
 )
 FORMATS = {"ECSV": "ascii.ecsv", "VOTable": "votable", "IPAC": "ascii.ipac"}
-"""Kinds of text that are not told by their marks, and astropy's names of them."""
+"""Kinds of text with a format of their own, and astropy's names of these."""
 MOST_COLUMNS = 999
 """Columns of a table, as of one in FITS."""
 MOST_VALUES, MOST_HEADER = 100_000, 100_000
@@ -240,8 +240,8 @@ class Table:
         return self.values(name) * self.factor(name, "rad") if gaps else self.numbers(name, "rad")
 
     def rename(self, aliases: Mapping[str, Sequence[str]]) -> None:
-        """Call columns as in ``aliases``: names that files have for each of ours, in small letters,
-        the best first.
+        """Rename columns to the keys of ``aliases``, whose values are the names that files have for
+        them, in small letters, the preferred one first.
 
         Capitals, blanks and a unit at the end (``ra_deg``) do not matter; ``coord.ra`` is ``ra``.
         Names that are not found stay.

@@ -145,7 +145,7 @@ class Record:
         ]
         if gone and self._new:
             more = f" and {len(gone) - 6} more" if len(gone) > 6 else ""
-            text = f"removed {', '.join(gone[:6])}{more}: of an earlier run, this one makes none"
+            text = f"removed {', '.join(gone[:6])}{more}: of an earlier run, not made by this one"
             warnings.warn(f"{self.folder}: {text}", stacklevel=4)
 
 

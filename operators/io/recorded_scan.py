@@ -28,7 +28,7 @@ SAME_BAND = 1e-2
 NEAR_BAND = 0.05
 """Relative difference of centres up to which a band is the one that was named."""
 NAMED_BAND = 0.2
-"""The same for a centre that is a mere name, as of f030, whose mean is at 25.7 GHz."""
+"""The same where a band's name alone gives the centre: SO's f030 has its mean at 25.7 GHz."""
 
 DEFAULTS = {
     "fwhm": 0.0,

@@ -43,7 +43,7 @@ LIMITS = {
     "centre_dec": (-np.pi / 2, np.pi / 2),
     "telescope_diameter": (1e-6, 1e6),
 }
-"""What is stated once: least and most, SI."""
+"""Least and most of numbers that a file states once, SI."""
 OF_SAMPLES = (
     "times",
     "seconds",
@@ -162,8 +162,8 @@ class TimeOrderedData:
         return len(self.names)
 
     def check(self, place: str) -> None:
-        """Raise an `InputError` about ``place`` where what is stated is no text or number of its
-        kind, shapes do not fit each other, or times and pointing are not finite.
+        """Raise an `InputError` about ``place`` where a statement is no text or number within its
+        limits, shapes do not fit each other, or times and pointing are not finite.
         """
         self._check_statements(place)
         n, d = np.shape(self.times)[:1], np.shape(self.names)
@@ -196,9 +196,7 @@ class TimeOrderedData:
             )
 
     def _check_statements(self, place: str) -> None:
-        """Raise an `InputError` where a text, a number or the start is none, or beyond its
-        limits.
-        """
+        """Raise `InputError` for a text or a start that is none, or a number beyond its limits."""
         site, *where = self.site
         texts = {"name": self.name, "telescope": self.telescope, "site": site, "start": self.start}
         wrong = [
@@ -225,7 +223,7 @@ class TimeOrderedData:
             if not isinstance(value, str | int | float | np.generic):
                 wrong.append(f"{name} is {value!r:.60}")
         if wrong:
-            text = f"states what cannot be: {'; '.join(wrong)}"
+            text = f"states impossible values: {'; '.join(wrong)}"
             raise InputError(text, place=place, cure="mend these values, or save it again")
 
     def of_samples(self) -> dict[str, NDArray[Any]]:

@@ -1,6 +1,6 @@
-"""From directions at instants to an `Observation` with its entries in the log: what all pointing
-steps share. And the Sun and the Moon during scans: distances, and flags and intervals of samples
-while the Sun is up or close to the boresight, as TOAST's `SimGround` makes them.
+"""Observations of all pointing steps, from directions at instants, with their entries in the log;
+the distances of the Sun and the Moon during scans, and flags and intervals of samples while the Sun
+is up or close to the boresight, as TOAST's `SimGround` makes them.
 """
 
 from __future__ import annotations

@@ -349,8 +349,8 @@ class PointingSchedule(ScheduleParameters):
     1 / cos(elevation) as fast): as in TOAST's `SimGround`, whose turnarounds, flags and intervals
     are the default. A scan begins at the lesser azimuth, towards larger ones, and has as many whole
     samples as fit. Its name ends with the patch, scan and subscan of the row. A row whose azmin is
-    its azmax is a stare; rows with SPECIAL (cooler cycles) and rows without duration are left out,
-    and told. A schedule that states its site is compared with the scene's: 5 km apart are a
+    its azmax is a stare; rows with SPECIAL (cooler cycles) and rows without duration are left out
+    with a warning. A schedule that states its site is compared with the scene's: 5 km apart are a
     warning, 100 km an error.
     """
 
