@@ -254,10 +254,11 @@ def _refused(
     cures = [f"use --memory {megabytes(need)}MB"] if need * 1.05 <= free else []
     smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in steps}
     own = need - parts[LIBRARIES]  # the process may hold more of other work
+    sizes = {o.label: parts.get(PRODUCTS, 0) for o in steps if makes_products(o)} | parts
     cures += [
         f"{label}: {how}"
         for label, how in smaller.items()
-        if how and parts.get(label, parts.get(PRODUCTS, 0)) > 0.1 * own
+        if how and sizes.get(label, 0) > 0.1 * own
     ]
     if parts.get(BLOCKS, 0) > 0.1 * need and parts[LIBRARIES] < budget:
         cures.append("split the scan into shorter ones")

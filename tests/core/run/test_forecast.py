@@ -214,6 +214,8 @@ def test_products_that_do_not_fit_when_they_are_written_are_refused(monkeypatch,
     )
     budget = BASE + 1200**2 * (64 + 40) + 30_000_000  # sums of two halves, planes
     pipeline = zonda.Pipeline([*steps, zonda.Plots()])
-    with pytest.raises(PipelineError, match=r"the run would hold .*Plots"):
+    with pytest.raises(PipelineError, match=r"the run would hold .*Plots") as refused:
         pipeline.run(scene, output=tmp_path, threads=1, ceiling=budget)
+    assert "BinMap: choose a larger pixel" in refused.value.cure
+    assert "streams" not in refused.value.cure  # none is kept
     zonda.Pipeline(steps).run(scene, output=tmp_path, threads=1, ceiling=budget)
