@@ -38,7 +38,7 @@ from zonda.operators.atmosphere.turbulence.geometry import (
 )
 from zonda.operators.atmosphere.turbulence.nodes import Layer
 
-from .survey import Noise, Survey, Track
+from .survey import Noise, Survey, Track, subset
 
 WAVES = 320
 """Number of waves: with 96 the rms is wrong by half where the atmosphere is a small part of the
@@ -319,9 +319,7 @@ def _rows(
     """
     every = len(survey.offsets)
     most = max(len(scan.track.index) for scan in scans)
-    few = np.arange(every)
-    if (number := max(DETECTORS, round(TEMPLATE / most))) < every:
-        few = np.sort(np.random.default_rng(6).permutation(every)[:number])
+    few = subset(every, max(DETECTORS, round(TEMPLATE / most)), seed=6)
     offsets = survey.offsets[few]
     cell = np.ptp(offsets, axis=0).max() / GROUPS + 1e-12
     places = np.floor((offsets - offsets.min(axis=0)) / cell)

@@ -34,7 +34,7 @@ from scipy.fft import next_fast_len, rfft
 from zonda.core.kernels import kernel
 from zonda.core.types import AnyFloats, Floats
 
-from .survey import Noise, Survey, Track
+from .survey import Noise, Survey, Track, sparse, subset
 
 NEAR = 8.0
 """Least distance of probes, in the beam's standard deviations."""
@@ -181,9 +181,7 @@ def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
     thin = min(max(1, round(number / SAMPLES)), max(1, instants // INSTANTS))
     fewer = min(len(offsets), max(1, round(thin * SAMPLES / number * len(offsets))))
     if fewer < len(offsets):
-        offsets = np.ascontiguousarray(
-            offsets[np.sort(np.random.default_rng(4).permutation(len(offsets))[:fewer])]
-        )
+        offsets = np.ascontiguousarray(offsets[subset(len(offsets), fewer, seed=4)])
     far = 1.05 * float(np.hypot(*survey.offsets.T).max()) + math.sqrt(2 * FAR) * survey.sigma
 
     def near(t: Track, c: Comb) -> Floats:
@@ -248,11 +246,9 @@ class Filtered:
         self._survey = survey
         self._left, self._all = np.zeros(number), np.zeros(number)
         self._every = len(survey.offsets) <= ALL
-        few = np.arange(len(survey.offsets))
-        if not self._every:
-            few = np.sort(np.random.default_rng(1).permutation(few)[:DETECTORS])
-        scans = sorted({round(k) for k in np.linspace(0, len(survey.observations) - 1, FILTERED)})
-        for scan in scans:
+        every = len(survey.offsets)
+        few = subset(every, every if self._every else DETECTORS)
+        for scan in sparse(len(survey.observations), FILTERED):
             track = survey.track(scan, rate)
             for series in draws:
                 self._add(scan, track, series(track, few))

@@ -50,7 +50,7 @@ from . import atmosphere_noise, detector_noise
 from .default_pipeline import parsed
 from .depth import Depth, read_depth
 from .detector_noise import Comb
-from .survey import Survey, Track, sparse
+from .survey import Survey, Track, sparse, subset
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -392,7 +392,7 @@ def _sums(survey: Survey, sky: SkyMap, noisy: float, air: bool) -> _Sums:
     scans = sparse(number, detector_noise.FILTERED)
     tracks = [survey.track(k, survey.rate) for k in scans]
     most = max(len(t.index) for t in tracks)
-    few = some(every, max(FEWEST, round(SAMPLES / most)))
+    few = subset(every, max(FEWEST, round(SAMPLES / most)))
     comb, one = Comb(np.zeros(2), 1.0, np.ones((1, 1), np.bool_)), np.ones((1, 1))
     stands, gain = every / len(few), 1.0
     if survey.common and len(few) < every:
@@ -440,14 +440,6 @@ def _values(beam: Beam) -> Floats:
 
 def _dot(a: AnyFloats, b: AnyFloats) -> float:
     return float(np.einsum("dt,dt->", a, b, dtype=np.float64))
-
-
-def some(every: int, number: int) -> NDArray[np.intp]:
-    """Numbers of so many detectors, which stand for all."""
-    few = np.arange(every)
-    if number < every:
-        few = np.sort(np.random.default_rng(1).permutation(few)[:number])
-    return few
 
 
 def series(sky: SkyMap, survey: Survey, track: Track, few: NDArray[np.intp]) -> AnyFloats:

@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.assembly.signals import note_signals
 from zonda.core.errors import PipelineError
@@ -473,6 +474,14 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
 def sparse(number: int, most: int) -> list[int]:
     """At most so many of the numbers below ``number``, evenly spaced."""
     return sorted({round(k) for k in np.linspace(0, number - 1, min(most, number)).tolist()})
+
+
+def subset(every: int, number: int, seed: int = 1) -> NDArray[np.intp]:
+    """At most ``number`` of the numbers below ``every``, drawn at random, in order."""
+    few = np.arange(every)
+    if number < every:
+        few = np.sort(np.random.default_rng(seed).permutation(few)[:number])
+    return few
 
 
 def polarization_angles(survey: Survey, observation: Observation, index: Any) -> PolarizationAngles:
