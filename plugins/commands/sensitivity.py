@@ -145,8 +145,7 @@ def sensitivity(
     one_blas_thread()
     from zonda.core.storage.files import check_output_folder
     from zonda.plugins.forecast import default_pipeline
-    from zonda.plugins.forecast.report import noise_alone, report
-    from zonda.plugins.forecast.sensitivity import SensitivityOfBands
+    from zonda.plugins.forecast.report import SensitivityOfBands, noise_alone, report
     from zonda.plugins.forecast.sensitivity import sensitivity as forecast
     from zonda.plugins.forecast.source import OF, sigmas
 

@@ -26,7 +26,7 @@ import math
 import re
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,7 @@ from zonda.operators.sky.skymap import SkyMap
 
 from . import atmosphere_noise, detector_noise
 from .default_pipeline import parsed
-from .depth import Depth, read_depth
+from .depth import Depth, in_unit, read_depth
 from .detector_noise import Comb
 from .survey import Survey, Track, sparse, subset
 
@@ -263,6 +263,41 @@ class Seen:
                 return seconds * (sigma / found) ** 2 if found > 0 else math.inf
         fine = np.geomspace(start, end, 2000)
         return float(fine[np.argmax(self.snr(depth, fine, of) >= sigma)])
+
+    def lines(self, factors: Mapping[str, float]) -> list[str]:
+        """The source in words, and which signal-to-noise ratios it has. ``factors``: as
+        `depth.factors`.
+        """
+        where = "at the map's centre"
+        if self.source.kind == "file":
+            where = f"peak {angle_text(self.away)} from the map's centre"
+        unit = next((u for u in factors if str(self.source.peak).endswith(u)), "Jy/beam")
+        seen = in_unit(self.peak * factors[unit], unit)
+        return [
+            f"source: {self.source.words}, {where}, {seen} ({in_unit(self.peak, 'K_RJ')}) at its"
+            " peak as the beam sees it",
+            f"  of its peak in the map smoothed with the beam, {in_unit(self.smoothed, 'K_RJ')},"
+            f" the filters leave {100 * self.kept[-1]:.3g} % (closed form)",
+            "  S/N of the peak: its height behind the filters in that map, over the rms there",
+            "  S/N of the template: the sum over the map of signal, weight and source as the beam"
+            " sees it, unfiltered, over",
+            "  the rms that all noise gives this sum (behind white noise sqrt(t^T N^-1 t), t the"
+            " filtered template)",
+        ]
+
+    def draw(self, ax: Any, depth: Depth, seconds: Floats) -> None:
+        """Draw the signal-to-noise ratios against time."""
+        for of, color in zip(OF, ("#0072B2", "#009E73"), strict=True):
+            ratio = self.snr(depth, seconds, of)
+            ax.plot(seconds / 3600, ratio, lw=2, color=color, label=of)
+        ax.axhline(5, color="black", lw=0.8, ls=":", label="5 sigma")
+        ax.set(xscale="log", yscale="log", xlabel="integration time [h]", ylabel="S/N")
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_formatter("{x:g}")
+        ax.grid(alpha=0.25, lw=0.5, which="both")
+        ax.legend(frameon=False)
+        kept = f"{100 * self.kept[-1]:.3g} % of its peak left"
+        ax.set_title(f"{self.source.words}: {kept}", fontsize=10)
 
 
 @dataclass(frozen=True)
