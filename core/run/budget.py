@@ -254,7 +254,8 @@ def _refused(
     cures = [f"use --memory {megabytes(need)}MB"] if need * 1.05 <= free else []
     smaller = {KEPT: FEWER} | {o.label: planning_of(o).smaller for o in steps}
     own = need - parts[LIBRARIES]  # the process may hold more of other work
-    sizes = {o.label: parts.get(PRODUCTS, 0) for o in steps if makes_products(o)} | parts
+    products = {o.label: parts.get(PRODUCTS, 0) for o in steps if makes_products(o)}
+    sizes = {**products, **parts}
     cures += [
         f"{label}: {how}"
         for label, how in smaller.items()
