@@ -4,6 +4,7 @@ result, nothing half-written.
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import shutil
@@ -199,8 +200,6 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(
     """Refused when they are begun: a mapping of a file that cannot grow later kills the process
     (SIGBUS).
     """
-    import errno
-
     from zonda.core.run.settings import Settings
     from zonda.core.run.streams import Store
 
@@ -416,7 +415,7 @@ def test_streams_that_are_full(
         patch.setattr(sys, "stdout", full())
         assert cli.main(["pipelines"]) == 2
         sys.stdout.close()
-    assert capsys.readouterr().err == "error: No space left on device\n"
+    assert capsys.readouterr().err == f"error: {os.strerror(errno.ENOSPC)}\n"
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", full())
         assert cli.main(["run", "small.yaml", "--output", "out"]) == 0

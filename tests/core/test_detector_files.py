@@ -145,11 +145,14 @@ def test_hardware_of_sotodlib(tmp_path: Path, name: str) -> None:
     np.testing.assert_allclose(plane.polarization_angle, ANGLES, atol=1e-12)
     np.testing.assert_allclose(plane.net, [1.1 * net(0)] * 2 + [1.1 * net(1)] * 2, rtol=1e-9)
     np.testing.assert_allclose([plane.knee, plane.slope], [[0.05] * 4, [3.0] * 4])
-    assert camera.notes["focal plane"] == (
-        "dark detectors, without a band, are left out: 1; bands are called without SAT_; NETs,"
-        " times NET_corr, are turned from K_CMB into K_RJ over the band of each detector; slopes"
-        " above 3 are taken as 3"
-    )
+    for told in (
+        "left out: 1",
+        "without SAT_",
+        "times NET_corr",
+        "from K_CMB into K_RJ",
+        "above 3",
+    ):
+        assert told in camera.notes["focal plane"]
 
 
 def test_bands_of_two_telescopes_keep_their_names(tmp_path: Path) -> None:

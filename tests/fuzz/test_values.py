@@ -43,14 +43,12 @@ JSON = (None, -1, 2**70, 1e308, float("nan"), "x", "", [], [[]], {}, {"a": 1}, T
 
 def in_json(value: Any, rng: random.Random) -> Any:
     """A JSON value in which one leaf or branch is another."""
-    keys = (
-        list(value)
-        if isinstance(value, dict)
-        else range(len(value) if isinstance(value, list) else 0)
-    )
+    keys: list[Any] = []
+    if isinstance(value, dict | list):
+        keys = list(value) if isinstance(value, dict) else list(range(len(value)))
     if not keys or rng.random() < 0.2:
         return rng.choice(JSON)
-    key = rng.choice(list(keys))
+    key = rng.choice(keys)
     made = dict(value) if isinstance(value, dict) else list(value)
     if rng.random() < 0.15:
         del made[key]

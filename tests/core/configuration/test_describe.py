@@ -73,12 +73,9 @@ def test_the_example_of_a_parameter_is_one_of_its_values() -> None:
                 continue
             seen[name, parameter] = unit.example
             scalar = "list" not in str(field.annotation) and "tuple" not in str(field.annotation)
-            kind: Any = (
-                Annotated[field.annotation, "", *field.metadata]
-                if scalar
-                else Annotated[float, unit]
-            )
-            assert isinstance(TypeAdapter(kind).validate_python(unit.example), float)
+            whole, part = Annotated[field.annotation, "", *field.metadata], Annotated[float, unit]
+            kept: Any = whole if scalar else part
+            assert isinstance(TypeAdapter(kept).validate_python(unit.example), float)
     assert len(seen) > 100
     assert seen["Telescope", "diameter"] == "12 m"
     assert seen["Site", "altitude"] == "2600 m"

@@ -124,7 +124,7 @@ def test_a_run_that_was_killed_leaves_files_that_the_next_one_knows(tmp_path, mo
 
 @pytest.mark.parametrize(
     "name",
-    ["../victim", "/etc/hostname", "sub/../../victim", ".", "", "link/victim", "a\0b", "\ud800", 5],
+    ["../victim", "{}/victim", "sub/../../victim", ".", "", "link/victim", "a\0b", "\ud800", 5],
 )
 def test_a_record_that_was_made_up_reaches_nothing_outside(tmp_path, name):
     out, victim = tmp_path / "out", tmp_path / "victim"
@@ -132,6 +132,8 @@ def test_a_record_that_was_made_up_reaches_nothing_outside(tmp_path, name):
     victim.write_text("precious")
     (out / "link").symlink_to(tmp_path)
     about = victim.stat()
+    if isinstance(name, str):
+        name = name.replace("{}", str(tmp_path))
     lines = [
         json.dumps([name, about.st_size, about.st_mtime_ns]),
         "[",
@@ -143,7 +145,6 @@ def test_a_record_that_was_made_up_reaches_nothing_outside(tmp_path, name):
     (out / written.NAME).write_text("\n".join(lines))
     run(out, "map.fits")
     assert victim.read_text() == "precious"
-    assert Path("/etc/hostname").exists()
 
 
 def test_a_record_that_is_a_link_is_refused(tmp_path):

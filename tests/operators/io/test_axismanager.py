@@ -2,6 +2,7 @@
 files of sotodlib itself."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -75,10 +76,8 @@ def test_the_stream_with_its_flags(tmp_path: Path) -> None:
     for mask, source in ((7, True), (3, False)):
         data = run(path, unit="mK_RJ", detector_mask=mask)
         of_f090, of_f150 = data.observations
-        assert (of_f090.n_detectors, of_f150.n_detectors) == (
-            3,
-            3,
-        )  # the dark one is with the first band
+        # the dark one is with the first band
+        assert (of_f090.n_detectors, of_f150.n_detectors) == (3, 3)
         stream = of_f090.detdata["signal"][0]
         bad = np.zeros(N, bool)
         bad[100:110] = True
@@ -153,7 +152,7 @@ def test_flac_without_its_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         about = json.loads(file.attrs["_axisman"])
         about["schema"][1]["encoding"] = "flacarray"
         file.attrs["_axisman"] = json.dumps(about)
-    monkeypatch.setitem(__import__("sys").modules, "flacarray.hdf5", None)
+    monkeypatch.setitem(sys.modules, "flacarray.hdf5", None)
     with pytest.raises(InputError, match=r"compressed with FLAC(.|\n)*pip install flacarray"):
         load_tod(path)
 

@@ -11,6 +11,27 @@ from zonda.core.errors import ZondaError
 
 from ..parameters import Step, cases, ignored
 
+MAPS: dict[str, Any] = {
+    "pixel": ({}, {"pixel": "3 arcsec"}),
+    "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
+    "projection": ({}, {"projection": "CAR"}),
+    "frame": ({}, {"frame": "galactic"}),
+    "nside": ({}, {"nside": 8192}),
+    "ordering": ({"nside": 8192}, {"ordering": "nested"}),
+    "stokes": ({}, {"stokes": "IQU"}),
+    "condition_limit": ({"stokes": "IQU"}, {"condition_limit": 3.0}),
+    "half_difference": ({}, {"half_difference": False}),
+    "crosslinking": ({}, {"crosslinking": True}),
+    "visits": ({}, {"visits": True}),
+    "scan_hits": ({}, {"scan_hits": True}),
+    "smooth": ({}, {"smooth": "beam"}),
+    "product": ({}, {"product": "chart"}),
+    "weights": ({}, {"weights": "uniform"}),
+    "noise": ({}, {"noise": "scatter"}),
+    "contents": ({}, {"contents": "hits"}),
+}
+"""Changes of what all map makers have."""
+
 STEPS = (
     Step(
         "BinMap",
@@ -20,26 +41,10 @@ STEPS = (
             {"ordering": "nested"},
         ),
         chain=("SkyMap", "WhiteNoise", "Efficiency", "BinMap"),
-        changes={
-            "pixel": ({}, {"pixel": "3 arcsec"}),
+        changes=MAPS
+        | {
             "width": ({}, {"width": "3 arcmin"}),
             "height": ({"width": "3 arcmin"}, {"height": "2 arcmin"}),
-            "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
-            "projection": ({}, {"projection": "CAR"}),
-            "frame": ({}, {"frame": "galactic"}),
-            "nside": ({}, {"nside": 8192}),
-            "ordering": ({"nside": 8192}, {"ordering": "nested"}),
-            "weights": ({}, {"weights": "uniform"}),
-            "noise": ({}, {"noise": "scatter"}),
-            "stokes": ({}, {"stokes": "IQU"}),
-            "condition_limit": ({"stokes": "IQU"}, {"condition_limit": 3.0}),
-            "contents": ({}, {"contents": "hits"}),
-            "half_difference": ({}, {"half_difference": False}),
-            "crosslinking": ({}, {"crosslinking": True}),
-            "visits": ({}, {"visits": True}),
-            "scan_hits": ({}, {"scan_hits": True}),
-            "smooth": ({}, {"smooth": "beam"}),
-            "product": ({}, {"product": "chart"}),
         },
         polarized=("condition_limit", "stokes"),
     ),
@@ -47,23 +52,10 @@ STEPS = (
         "MaximumLikelihoodMap",
         ignored=({"nside": 1024, "pixel": "3 arcsec"}, {"ordering": "nested"}),
         chain=("SkyMap", "WhiteNoise", "PinkNoise", "Efficiency", "MaximumLikelihoodMap"),
-        changes={
-            "pixel": ({}, {"pixel": "3 arcsec"}),
+        changes=MAPS
+        | {
             "width": ({}, {"width": "12 arcmin"}),
             "height": ({"width": "12 arcmin"}, {"height": "13 arcmin"}),
-            "centre": ({}, {"centre": "05h00m01s +20d00m00s"}),
-            "projection": ({}, {"projection": "CAR"}),
-            "frame": ({}, {"frame": "galactic"}),
-            "nside": ({}, {"nside": 8192}),
-            "ordering": ({"nside": 8192}, {"ordering": "nested"}),
-            "stokes": ({}, {"stokes": "IQU"}),
-            "condition_limit": ({"stokes": "IQU"}, {"condition_limit": 3.0}),
-            "half_difference": ({}, {"half_difference": False}),
-            "crosslinking": ({}, {"crosslinking": True}),
-            "visits": ({}, {"visits": True}),
-            "scan_hits": ({}, {"scan_hits": True}),
-            "smooth": ({}, {"smooth": "beam"}),
-            "product": ({}, {"product": "chart"}),
             "baseline": ({}, {"baseline": "0.4 s"}),
             "modes": ({}, {"modes": 2}),
             "free": ({}, {"free": 0}),
@@ -71,9 +63,6 @@ STEPS = (
             "refine": ({}, {"refine": 0}),
             "tolerance": ({}, {"tolerance": 1e-2}),
             "undetermined": ({}, {"undetermined": "none"}),
-            "weights": ({}, {"weights": "uniform"}),
-            "noise": ({}, {"noise": "scatter"}),
-            "contents": ({}, {"contents": "hits"}),
         },
         refused=dict.fromkeys(("weights", "noise", "contents"), "belong to BinMap"),
         polarized=("condition_limit", "stokes"),

@@ -238,9 +238,9 @@ def test_a_schedule_without_a_site_and_a_wrong_one(tmp_path):
     path = version_5(tmp_path / "a.ecsv")
     assert read_schedule(path)[1] is None  # no longitude
     text = path.read_text()
-    for wrong, found in (("!other.Tag {a: 1}", "latitude"), ("north", "latitude")):
+    for wrong in ("!other.Tag {a: 1}", "north"):
         path.write_text(text.replace("# schema", f"# - site_lon: {wrong}\n# schema"))
-        with pytest.raises(InputError, match=found):
+        with pytest.raises(InputError, match="latitude"):
             read_schedule(path)
     unknown = (
         version_4(tmp_path / "a.txt")
