@@ -62,7 +62,7 @@ def content() -> dict[str, Any]:
 
 
 def write(group: Any, fields: dict[str, Any], units: dict[str, str] | None = None) -> None:
-    """As sotodlib's `_save_axisman`: arrays of (dets, samps), (samps,) or (dets,)."""
+    """Write fields as sotodlib's `_save_axisman` does: arrays of (dets, samps), (samps,) or (dets,)."""
     axes = {(N,): ["samps"], (len(NAMES),): ["dets"], (len(NAMES), N): ["dets", "samps"]}
     schema: list[dict[str, Any]] = []
     scalars = {}

@@ -1,4 +1,4 @@
-"""What instruments, bands, scans, atmospheres, streams and maps draw of themselves in Python."""
+"""Plots of instruments, bands, scans, atmospheres, streams and maps in Python."""
 
 from __future__ import annotations
 

@@ -63,8 +63,8 @@ def test_help_shows_every_parameter_and_nothing_of_pydantics(name: str) -> None:
 
 
 def test_the_example_of_a_parameter_is_one_of_its_values() -> None:
-    """Of every parameter with a unit, within its limits, and not of the size of another: a
-    telescope of 1.8 mm, an altitude of 1.8 mm.
+    """Each parameter with a unit has an example within its limits and of its own size; not a
+    telescope or an altitude of 1.8 mm.
     """
     seen = {}
     for name in [*operators, "Scene", "Site", "Instrument", "Telescope", "Band"]:

@@ -222,7 +222,7 @@ def test_a_noise_level_in_another_unit_is_told_its_conversion(text: str, cure: s
 
 
 def test_the_conversions_of_noise_levels() -> None:
-    """As the messages and docs/plugins.md have them, against the constants."""
+    """The factors that messages and docs/plugins.md state follow from the constants."""
     solid_angle = np.pi / (4 * np.log(2)) * np.radians(1 / 3600) ** 2
     assert 1e-29 * intensity_to_kelvin(1e9) / solid_angle == pytest.approx(1222, rel=1e-3)
     assert pytest.approx(56.79, rel=1e-4) == BOLTZMANN * T_CMB / PLANCK / 1e9

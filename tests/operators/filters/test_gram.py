@@ -121,7 +121,7 @@ def test_copies_at_one_time_are_what_there_is_room_for(bench, tmp_path, monkeypa
 
 
 def test_the_copy_is_announced(bench):
-    """That of each thread, of a stream on disk; one that is in memory is not copied."""
+    """Each thread copies a part of a stream on disk; a stream in memory is not copied."""
     planning = planning_of(CommonModeFilter())
     for n_det in (300, 9000, 50_000):
         for n in (64, 4096):

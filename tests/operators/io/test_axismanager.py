@@ -102,7 +102,7 @@ def test_az_el_and_roll_are_the_boresight(tmp_path: Path) -> None:
 
 
 def test_units(tmp_path: Path) -> None:
-    """Of a Quantity, of the parameter, of the CMB in each band; none is refused."""
+    """The unit is that of a Quantity or of the parameter, of the CMB too; without one it is refused."""
     bare = saved(tmp_path / "a.h5")
     with pytest.raises(InputError, match=r"has no unit(.|\n)*LoadTOD: {unit: K_CMB}"):
         run(bare)

@@ -194,7 +194,7 @@ def test_bits_depend_neither_on_threads_nor_on_other_signals():
 
 
 def test_the_map_without_filters_is_a_mean():
-    """What transfer functions compare with is no maximum-likelihood map itself: pixels as wide as
+    """Transfer functions divide by a plain mean, not by a maximum-likelihood map: pixels as wide as
     the beam, in which the sky is no constant, tell the two apart."""
     runs = {"seen": {"only": ["sky"]}, "true": {"only": ["sky"], "filters": "none"}}
     cluster = Path(zonda.pipelines.__path__[0]) / "data" / "merging_cluster.fits"
@@ -300,7 +300,7 @@ def test_streams_without_noise_are_refused():
 
 
 def test_flagged_samples_and_detectors_have_no_part():
-    """What they hold changes no bit of the map."""
+    """Their values change no bit of the map."""
     o, rng = observation(), np.random.default_rng(7)
     o.flags[1000:1100] = 2
     o.detector_flags[3] = 2

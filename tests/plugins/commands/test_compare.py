@@ -398,7 +398,7 @@ def test_a_pipe_is_not_waited_for(tmp_path, values, capsys, suffix):
 
 
 def test_fluxes_in_apertures_of_two_files(tmp_path, capsys):
-    """Of a Gaussian and 0.6 of it, in two units."""
+    """A Gaussian and 0.6 of it, in two units."""
     y, x = np.indices((61, 61)) - 30
     wide = {"CDELT1": -4 / 3600, "CDELT2": 4 / 3600}
     shape = np.exp(-4 * np.log(2) * (x**2 + y**2) * (4 / 30) ** 2)
