@@ -1,4 +1,4 @@
-"""Instruments as text; pictures of focal planes, passbands, scans and time streams.
+"""Pictures of focal planes, passbands, scans and time streams.
 
 An `Instrument`, `Band` or `Observation` draws itself with these functions, whose arguments have no
 such types therefore: modules import each other one way.
@@ -7,7 +7,6 @@ such types therefore: modules import each other one way.
 from __future__ import annotations
 
 import math
-import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -16,138 +15,11 @@ import numpy as np
 from .canvas import SEQUENCE, finish, new_figure, unit_of, wide_legend
 from .focalplane import Focalplane
 from .numerics.projection import boresights
-from .numerics.sphere import ARCMIN, angle_text, local_axes
-from .tables import aligned
+from .numerics.sphere import ARCMIN, local_axes
 from .types import AnyFloats, Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-STAND_IN = "stand-in: "
-"""Beginning of a part of `provenance` that names a number which is not published; parts end with a
-semicolon."""
-HEAD = ("band", "GHz", "detectors", "FWHM", "NET [mK_RJ sqrt(s)]", "knee [Hz]", "slope")
-WIDTH = 100
-
-
-def lines(instrument: Any, plane: Focalplane) -> list[str]:
-    """Text of an instrument: its bands, the sources of its numbers, and which are stand-ins."""
-    telescope = instrument.telescope
-    rows = [
-        (
-            "telescope",
-            f"{telescope.name}, {telescope.diameter:g} m"
-            + (f", at {telescope.site}" if telescope.site else ""),
-        ),
-        ("field of view", angle_text(instrument.field_of_view)),
-        ("detectors", _detectors(instrument, plane)),
-        ("sample rate", f"{instrument.sample_rate:g} Hz"),
-        (
-            "efficiencies",
-            (
-                f"main beam {instrument.main_beam_efficiency:g}, illumination"
-                f" {instrument.illumination_efficiency:g}"
-            ),
-        ),
-    ]
-    head = (
-        f"{instrument.name}: {instrument.description}"
-        if instrument.description
-        else instrument.name
-    )
-    found = [
-        head,
-        "",
-        *aligned(rows, gap=" "),
-        "",
-        *_bands(instrument, plane),
-    ]
-    sources, stand_ins = split_provenance(instrument)
-    for title, texts in (("source", sources), ("stand-ins", stand_ins)):
-        if texts:
-            found.append("")
-            wide = " " * (max(len(key) for key, _ in rows) - len(title))
-            first, *others = _wrapped(texts)
-            found += aligned([(title + wide, first), *(("", line) for line in others)], gap=" ")
-    return found
-
-
-def split_provenance(instrument: Any) -> tuple[list[str], list[str]]:
-    """Split sources of the numbers of an instrument and its bands from stand-ins."""
-    bands = [
-        (f"{name}: " if instrument.bands else "band: ", camera.band)
-        for name, camera in instrument.cameras.items()
-    ]
-    parts = [part.strip() for part in instrument.provenance.split(";")]
-    parts += [
-        (STAND_IN if part.strip().startswith(STAND_IN) else "")
-        + who
-        + part.strip().removeprefix(STAND_IN)
-        for who, band in bands
-        for part in band.provenance.split(";")
-    ]
-    parts = [part for part in dict.fromkeys(parts) if part and not part.endswith(": ")]
-    named = [part.removeprefix(STAND_IN) for part in parts if part.startswith(STAND_IN)]
-    return [part for part in parts if not part.startswith(STAND_IN)], named
-
-
-def _detectors(instrument: Any, plane: Focalplane) -> str:
-    how = f"{instrument.layout} layout"
-    if instrument.focalplane_table is not None:
-        how = f"from {instrument.focalplane_table.name}"
-    wafers = len(np.unique(plane.wafer))
-    each = (
-        " in each band"
-        if instrument.bands
-        and instrument.pixels != "shared"
-        and instrument.focalplane_table is None
-        else ""
-    )
-    said = [
-        f"{len(plane)}",
-        how,
-        f"{wafers} wafers{each}" if wafers > 1 else "",
-        "polarized" if plane.polarized else "not polarized",
-    ]
-    if len(instrument.bands) > 1 and instrument.focalplane_table is None:
-        said.insert(2, f"pixels {instrument.pixels}")
-    if dead := int(plane.dead.sum()):
-        said.append(f"{dead} dead")
-    return ", ".join(filter(None, said))
-
-
-def _bands(instrument: Any, plane: Focalplane) -> list[str]:
-    table = []
-    for k, (name, camera) in enumerate(instrument.cameras.items()):
-        rows = plane.of_band(k) if instrument.bands else plane
-        nu = np.array(camera.band.edges) / 1e9
-        table.append(
-            (
-                name,
-                f"{nu[0]:.4g} to {nu[-1]:.4g}",
-                f"{len(rows)}",
-                _angles(rows.fwhm),
-                _span(rows.net * 1e3),
-                _span(rows.knee),
-                _span(rows.slope),
-            )
-        )
-    return aligned(table, HEAD)
-
-
-def _span(values: Floats) -> str:
-    low, high = (f"{value:.3g}" for value in (values.min(), values.max()))
-    return low if low == high else f"{low} to {high}"
-
-
-def _angles(values: Floats) -> str:
-    low, high = (angle_text(float(value)) for value in (values.min(), values.max()))
-    return low if low == high else f"{low} to {high}"
-
-
-def _wrapped(texts: list[str]) -> list[str]:
-    return [line for text in texts for line in textwrap.wrap(text, WIDTH, subsequent_indent="  ")]
-
 
 UNITS = ((math.radians(1), "deg"), (math.radians(1 / 60), "arcmin"), (0.0, "arcsec"))
 """Least size for which a unit is taken, rad, and its name."""

@@ -11,9 +11,9 @@ from click.testing import CliRunner
 
 from zonda.core import cli
 from zonda.core.instrument import Instrument
-from zonda.core.plots import focal_plane_figure, lines, split_provenance
+from zonda.core.plots import focal_plane_figure
 from zonda.core.registry import instruments
-from zonda.plugins.commands.show import show
+from zonda.plugins.commands.show import lines, show, split_provenance
 
 
 def shown(name: str, path: Path) -> str:
