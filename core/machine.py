@@ -39,7 +39,7 @@ def resident_memory() -> int:
 
 
 def give_back_memory() -> None:
-    """Give the system what the allocator keeps of freed arrays, where it can (glibc)."""
+    """Return memory of freed arrays, which the allocator keeps, to the system (glibc only)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 

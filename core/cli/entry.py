@@ -205,7 +205,7 @@ class _Unbroken:
 
 @contextlib.contextmanager
 def _unbroken_streams() -> Iterator[None]:
-    """Let a command end as it would where a standard stream is closed or its reader is gone."""
+    """Let a command end as usual if a standard stream is closed or its reader is gone."""
     usual: Any = (sys.stdout, sys.stderr)
     with contextlib.ExitStack() as opened:
         taken = [

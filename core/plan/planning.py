@@ -154,8 +154,8 @@ class Planning(Generic[O]):
         return self.memory(observation) + threads * self.per_thread(observation, spilled)
 
     def finished(self, observation: Observation) -> tuple[int, int]:
-        """Bytes while the product is finished, and of the product then; `memory` is what is held
-        of it before.
+        """Bytes held while the product is finished, and bytes of the finished product; `memory` is
+        held until then.
         """
         return (self.memory(observation),) * 2
 

@@ -24,7 +24,6 @@ from .views import Band, View
 BASE = 240_000_000
 """Bytes of the interpreter, libraries, compiled code, and what the allocator keeps."""
 
-
 LIBRARIES = "zonda and its libraries"
 PRODUCTS = "products"
 ON_DISK = "pages of streams on disk"
@@ -35,8 +34,8 @@ FEWER = "keep fewer streams, of fewer or shorter scans"
 
 
 def at_end(views: Sequence[View], outputs: Sequence[Operator]) -> dict[str, int]:
-    """Bytes by what holds them when scans are done: products that are finished, band after band, or
-    finished ones with the outputs that act on them, whichever is more.
+    """Bytes after the last scan, by what holds them: the products while they are finished, band
+    after band, or finished ones with the outputs that act on them, whichever is more.
     """
     each, pixels = list[tuple[int, int, int]](), 0
     for view in views:

@@ -91,7 +91,7 @@ def recording(folder: Path, *, anew: bool, inputs: Iterable[Path] = ()) -> Itera
         As `earlier`.
     """
     if any(record.folder == Path(os.path.abspath(folder)) for record in files.RECORDS):
-        yield  # of the caller
+        yield  # the caller records
         return
     record = Record(folder, earlier(folder, inputs) if anew else None)
     files.RECORDS.append(record)

@@ -203,7 +203,7 @@ class CommonModePlanning(Planning[CommonModeFilter]):
 
     def memory(self, observation: Observation) -> int:
         """Series over the scan: one for each step of the iteration, or the sums of
-        `common_mode.read_mean`; the copy of one tile.
+        `common_mode.read_mean`.
         """
         n_det, n_samp = observation.n_detectors, observation.n_samples
         if self.operator.method == "mean":

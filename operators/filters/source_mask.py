@@ -46,8 +46,8 @@ RADIUS = math.radians(1 / 60)
 ENOUGH = 256
 """Instants of a look at a scan from which it is judged whether a mask covers it."""
 MUCH = 0.2
-"""Share of the samples in a mask from which a filter of each detector's scan has too little to go
-by: drifts are guessed across the mask.
+"""Share of masked samples above which a warning is given: a filter of each detector's scan must
+then guess drifts across the mask from too few samples.
 """
 MASKED = "samples in the source mask, not used to find what is removed"
 """A count of the log."""
@@ -57,7 +57,7 @@ SMALLER = "choose a smaller mask"
 
 
 def _percent(share: float) -> str:
-    """A share to a twentieth: looks at different instants say the same."""
+    """Share rounded to 5 %: different choices of instants give the same text."""
     return f"about {max(5 * round(20 * share), 1)} %"
 
 
@@ -91,8 +91,8 @@ class SourceMask(Parameters):
         return self
 
     def of_part(self, observation: Observation, label: str) -> Inside:
-        """Samples of a scan that are inside; some must be outside, and it warns where that are few
-        (of the first scan).
+        """Samples of a scan that are inside; some must be outside. Few samples outside are warned
+        of, in the first scan.
 
         Raises InputError for a file that cannot be used, and PipelineError where the mask covers
         all that the middle detector sees.

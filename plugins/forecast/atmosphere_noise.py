@@ -96,8 +96,8 @@ class Left:
 
 
 class Template(NamedTuple):
-    """A source of which equation (1) is made in place of the beam's: with
-    sum_d s_dt (exp(i q J d) - A) for g (exp(i q J delta) - A), (sum a s F s)^2 for (sum_t g)^2.
+    """A source in place of the beam in equation (1): sum_d s_dt (exp(i q J d) - A) replaces
+    g (exp(i q J delta) - A), and (sum a s F s)^2 replaces (sum_t g)^2.
 
     Attributes
     ----------

@@ -263,7 +263,9 @@ class Day:
 
     @classmethod
     def of(cls, site: Site, middle: Instant, target: Target) -> Day:
-        """Raises PointingError where the target never rises."""
+        """Elevations on the day about ``middle``. Raises PointingError where the target never
+        rises.
+        """
         from zonda.core.numerics.celestial import CelestialTransform
 
         if target.frame == "horizontal":

@@ -10,10 +10,10 @@ With s_i the source as the beam of sample i = (detector d, time t) sees it, F th
 
 (2) is the height of the peak in the map that is smoothed with the beam, over the rms there. (3) is
 the map multiplied with the source as the beam sees it, unfiltered, and the weights of its pixels.
-What F takes out it takes out once (F F = F), so that behind white noise of variance sigma^2 this is
-the matched filter: with t the filtered template, N the covariance of the map's pixels, (3) is
-(t^T N^-1 t)^(1/2), because t = N (a s / sigma^2). 1/f noise and atmosphere count in the rms, and
-the weights stay those of white noise.
+F is a projection (F F = F), so that for white noise of variance sigma^2 this is the matched filter:
+with t the filtered template, N the covariance of the map's pixels, (3) is (t^T N^-1 t)^(1/2),
+because t = N (a s / sigma^2). 1/f noise and atmosphere count in the rms, and the weights stay those
+of white noise.
 
 (1) is a closed form: the pipeline's own high-pass filter is applied to s along the scans, and the
 common mode is the mean of the detectors. It holds for sources that are faint beside what all
@@ -106,8 +106,9 @@ class Source(NamedTuple):
 
     @classmethod
     def parse(cls, text: str, peak: str | None = None, flux: str | None = None) -> Source:
-        """Raises InputError for what is no source, and for a brightness that is missing or given
-        twice."""
+        """Read a source from text. Raises InputError for text that names none, and for a
+        brightness that is given twice.
+        """
         words = str(text).split()
         kind = words[0].lower() if words else ""
         cure = f"write {FORMS}"
@@ -320,8 +321,9 @@ class Placed:
         source: Source,
         factors: Mapping[str, float] | None = None,
     ) -> Placed:
-        """``factors``: as `depth.factors`, for the brightness that is asked for; None: that which
-        `Source.sky` makes.
+        """Find the peak of a source on the map, and scale it to the brightness that is asked for.
+
+        ``factors``: as `depth.factors`; None: it stays as `Source.sky` makes it.
 
         Raises InputError as `Source.sky`, for a peak that is not on the map, and a brightness that
         is not known.
@@ -341,7 +343,7 @@ class Placed:
         return found if factors is None else found._as_bright(survey, factors)
 
     def _where_it_is(self, survey: Survey, towards: Floats) -> Placed:
-        """With the place of its peak, an ICRS direction (3,)."""
+        """The source with the place of its peak. ``towards`` (3,): the peak's ICRS direction."""
         grid = survey.grid
         half = min(grid.shape) * grid.pixel / 2
         lon, lat = (float(v) for v in angles(frame_rotation(grid.frame) @ towards))
@@ -358,7 +360,7 @@ class Placed:
         return replace(self, centre=(lon, lat), away=away)
 
     def _as_bright(self, survey: Survey, factors: Mapping[str, float]) -> Placed:
-        """With the brightness that is asked for."""
+        """The source with the brightness that is asked for."""
         source = self.source
         if source.peak is not None:
             units = {unit: factor for unit, factor in factors.items() if unit != "Jy"}

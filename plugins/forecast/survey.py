@@ -498,7 +498,7 @@ def polarization_angles(survey: Survey, observation: Observation, index: Any) ->
 
 
 def _alive(observation: Observation) -> Observation:
-    """The scan with the detectors that give data alone."""
+    """The scan with only those detectors that give data."""
     kept = np.flatnonzero(observation.good_detectors)
     plane, flags = observation.focalplane.rows(kept), observation.detector_flags[kept]
     return replace(observation, focalplane=plane, detector_flags=flags)
