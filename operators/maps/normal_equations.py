@@ -147,18 +147,14 @@ class NormalEquations:
 
     def apply(self, m: Floats) -> Floats:
         """P^T Q P m."""
-        if self.n_stokes == 1:
-            out = self.weights * m
-        else:
-            out = np.stack([(self.weights[list(row)] * m).sum(axis=0) for row in _ROWS])
-        return out + self._added([m] * len(self.scans))
+        return times(self.weights, m) + self._added([m] * len(self.scans))
 
     def solve(self, right: Floats, tolerance: float, most: int) -> Solution:
         """Conjugate gradients from 0, at most so many iterations: the map with the least residual.
         Behind it, and along patterns that the data do not determine, there is rounding alone.
         """
         m, r = np.zeros_like(right), right.copy()
-        z = self._preconditioned(r)
+        z = times(self._inverse, r)
         p, product = z.copy(), float((r * z).sum())
         first, history = product, list[float]()
         steps, turns, best, size = list[float](), list[float](), m, product
@@ -169,7 +165,7 @@ class NormalEquations:
             step = product / curvature
             m += step * p
             r -= step * q
-            z = self._preconditioned(r)
+            z = times(self._inverse, r)
             product, before = float((r * z).sum()), product
             steps.append(step)
             turns.append(product / before)
@@ -195,11 +191,6 @@ class NormalEquations:
             total += part
         return total
 
-    def _preconditioned(self, r: Floats) -> Floats:
-        if self.n_stokes == 1:
-            return self._inverse * r
-        return np.stack([(self._inverse[list(row)] * r).sum(axis=0) for row in _ROWS])
-
     def _inverse_weights(self) -> Floats:
         """Pseudo-inverse of the weights, in their places; 0 without samples."""
         out = np.zeros_like(self.weights)
@@ -215,8 +206,11 @@ class NormalEquations:
         return out
 
 
-_ROWS = (0, 1, 2), (1, 3, 4), (2, 4, 5)
-"""Places of the rows of a symmetric matrix: ii, iq, iu, qq, qu, uu."""
+def times(matrix: Floats, m: Floats) -> Floats:
+    """Product of a symmetric matrix in each pixel, (1 or 6, n_pixels), with a map."""
+    if len(matrix) == 1:
+        return matrix * m
+    return np.stack([(matrix[list(row)] * m).sum(axis=0) for row in np.reshape(PLACES, (3, 3))])
 
 
 def ritz_values(steps: Sequence[float], turns: Sequence[float]) -> Floats:
