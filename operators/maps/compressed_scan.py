@@ -272,6 +272,13 @@ def _find(  # type: ignore[no-untyped-def]
     return k + 1
 
 
+@kernel(inline="always")
+def _step(steps, t, a, d, height):  # type: ignore[no-untyped-def]
+    """Add what a step of detector d at t makes of s."""
+    for k in range(a.shape[0]):
+        steps[k, t] += a[k, d] * height
+
+
 @kernel
 def _see(first, pixel, samples, angles, counted, m, a, y, steps):  # type: ignore[no-untyped-def]
     """Equations (1) and (2) of a map, the latter as steps."""
@@ -300,13 +307,11 @@ def _see(first, pixel, samples, angles, counted, m, a, y, steps):  # type: ignor
                     if polarized:
                         v += angles[0, r] * m[1, p] + angles[1, r] * m[2, p]
                 if v != before:
-                    for k in range(a.shape[0]):
-                        steps[k, t] += a[k, d] * (v - before)
+                    _step(steps, t, a, d, v - before)
                     before = v
                 t += samples[r]
         if before != 0.0:
-            for k in range(a.shape[0]):
-                steps[k, t] -= a[k, d] * before
+            _step(steps, t, a, d, -before)
 
 
 @kernel
@@ -351,13 +356,11 @@ def _lower(first, pixel, samples, counted, nowhere, a, y, steps):  # type: ignor
             for r in range(first[d * n_base + b], first[d * n_base + b + 1]):
                 v = -y[d, b] if pixel[r] < nowhere else 0.0
                 if v != before:
-                    for k in range(a.shape[0]):
-                        steps[k, t] += a[k, d] * (v - before)
+                    _step(steps, t, a, d, v - before)
                     before = v
                 t += samples[r]
         if before != 0.0:
-            for k in range(a.shape[0]):
-                steps[k, t] -= a[k, d] * before
+            _step(steps, t, a, d, -before)
 
 
 @kernel
