@@ -308,7 +308,7 @@ def covered_healpix(
     import healpy
 
     size = float(healpy.nside2resol(nside))
-    found, pieces = np.zeros(0, np.int64), list[NDArray[np.int64]]()
+    found, pieces, together = np.zeros(0, np.int64), list[NDArray[np.int64]](), 0
     for observation in observations:
         radius = math.atan(observation.focalplane.radius)
         spacing = max(radius, size) / 4
@@ -324,8 +324,9 @@ def covered_healpix(
         margin = min(radius + float(healpy.max_pixrad(fine)) * 2, math.pi)
         for k in first:
             pieces.append(healpy.query_disc(nside, boresight[k], margin, inclusive=True, nest=nest))
-            if sum(piece.size for piece in pieces) > max(found.size, LEAST_TOGETHER):
-                found, pieces = _union([found, *pieces]), []  # discs overlap
+            together += pieces[-1].size
+            if together > max(found.size, LEAST_TOGETHER):
+                found, pieces, together = _union([found, *pieces]), [], 0  # discs overlap
     return _union([found, *pieces])
 
 
