@@ -28,10 +28,8 @@ from zonda.core.types import Floats
 
 from .baseline_noise import BaselineNoise
 from .compressed_scan import CompressedScan
+from .map_from_sums import SINGULAR, TRIANGLE
 from .stokes_kernel import PLACES
-
-SINGULAR = 1e-8
-"""Of the smallest eigenvalue of the weights in a pixel, as a share of the largest."""
 
 UNDETERMINED = 1e-8
 """A direction p with less information p^T A p, as a share of that of white noise, p^T W p with the
@@ -202,7 +200,7 @@ class NormalEquations:
         fine = low > SINGULAR * low[:, 2:]
         inverse = np.where(fine, 1 / np.where(fine, low, 1.0), 0.0)
         every = np.einsum("nij,nj,nkj->nik", axes, inverse, axes)
-        out[:, seen] = every[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)].T
+        out[:, seen] = every[:, *TRIANGLE].T
         return out
 
 
