@@ -203,14 +203,9 @@ def bins_of(n: int) -> NDArray[np.intp]:
 
 def polynomials(n: int, degree: int) -> Floats:
     """Orthonormal polynomials (degree + 1, n) up to a degree."""
-    x, found = np.linspace(-1, 1, n) if n > 1 else np.zeros(1), list[Floats]()
-    for power in range(min(degree + 1, n)):
-        row = x**power
-        for _ in range(2):
-            for other in found:
-                row = row - (row * other).sum() * other
-        found.append(row / np.sqrt((row * row).sum()))
-    return np.array(found)
+    x = np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
+    powers = np.array([x**power for power in range(min(degree + 1, n))])
+    return _orthonormal(powers, np.zeros((0, n)))
 
 
 def leading(rows: Floats, number: int, known: Floats) -> Floats:
