@@ -228,7 +228,7 @@ class Observation:
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
     smooth: dict[str, SmoothField] = field(default_factory=dict)
-    detdata: KeptStreams = field(default_factory=lambda: KeptStreams())
+    detdata: KeptStreams = field(default_factory=KeptStreams)
     noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
     closed_forms: dict[str, list[Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = field(
         default_factory=dict
@@ -450,11 +450,8 @@ class Observation:
         found = (-self.derotate("boresight_azel")[0] if recorded is None else recorded) % (
             2 * np.pi
         )
-        return np.where(
-            found < 2 * np.pi,
-            found,
-            0.0,
-        )  # the remainder of what is a rounding below zero
+        # the remainder of what is a rounding below zero
+        return np.where(found < 2 * np.pi, found, 0.0)
 
     @property
     def elevation(self) -> AnyFloats:

@@ -434,11 +434,7 @@ def tangent_pixels(h, first, stop, xi, eta, ny, nx, out):  # type: ignore[no-unt
     ``h`` (9, n_samp).
     """
     wide, high, row_length = np.float64(nx), np.float64(ny), np.int32(nx)
-    for low in range(
-        first,
-        stop,
-        256,
-    ):  # these coefficients stay in the first cache for all detectors
+    for low in range(first, stop, 256):  # coefficients stay in the first cache for all detectors
         end = min(low + 256, stop)
         h0, h1, h2 = h[0, low:end], h[1, low:end], h[2, low:end]
         h3, h4, h5 = h[3, low:end], h[4, low:end], h[5, low:end]

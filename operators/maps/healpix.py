@@ -79,11 +79,7 @@ def healpix_pixels(  # type: ignore[no-untyped-def]
         np.empty(256),
         np.empty(256, np.int64),
     )
-    for low in range(
-        first,
-        stop,
-        256,
-    ):  # these coefficients stay in the first cache for all detectors
+    for low in range(first, stop, 256):  # coefficients stay in the first cache for all detectors
         end = min(low + 256, stop)
         for d in range(xi.size):
             _angles(h, low, end, xi[d], eta[d], height, cap, quarter)

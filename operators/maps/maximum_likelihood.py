@@ -71,7 +71,6 @@ class MaximumLikelihoodMap(BinMap):
     """
 
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
-    knows_means: ClassVar[bool] = True
     all_bands: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     averages: ClassVar[bool] = False
