@@ -188,7 +188,7 @@ def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
     ax.plot(scale[known], shown[1], "--", color=SEQUENCE[1], linewidth=1.2, label=label)
     ax.set_xscale("log")
     ax.set_xlim(edges[0], edges[-1])
-    top, bottom = (float(f(shown, initial=x)) for f, x in ((np.max, 1.0), (np.min, 0.0)))
+    top, bottom = float(np.max(shown, initial=1.0)), float(np.min(shown, initial=0.0))
     ax.set_ylim(1.05 * bottom, 1.15 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
