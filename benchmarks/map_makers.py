@@ -27,10 +27,16 @@ import numpy as np  # noqa: E402
 from scipy import ndimage  # noqa: E402
 
 import zonda  # noqa: E402
-import zonda.pipelines  # noqa: E402
 from zonda.operators.maps import maximum_likelihood as ml  # noqa: E402
 
-CLUSTER = Path(zonda.pipelines.__path__[0]) / "data/merging_cluster.fits"
+RESPONSE = "AtmosphereLayers.layer_response=layer"
+PIPELINES = {
+    "m2": ("mustang2_cluster", ("PointingDaisy.scans=2", RESPONSE)),
+    "atlast": (
+        "atlast_reduced",
+        ("PointingDaisy.scans=1", "PointingDaisy.scan_duration=20 s", RESPONSE),
+    ),
+}
 SCALES = {
     "m2": [720, 480, 320, 220, 150, 100, 70, 50, 30, 20, 12, 8],
     "atlast": [1800, 1200, 800, 500, 300, 180, 100, 60, 30, 15],
@@ -47,9 +53,7 @@ class Maker(zonda.MaximumLikelihoodMap):
 
         class Keeps(ml.LikelihoodMaps):
             def map_of(self, stream: str) -> Any:
-                start = time.process_time()
                 equations = self.equations
-                maps["refine"] = maps.get("refine", 0.0) + time.process_time() - start
                 start = time.process_time()
                 solution = self._solved(equations, stream)
                 seconds = time.process_time() - start
@@ -64,60 +68,26 @@ class Maker(zonda.MaximumLikelihoodMap):
         KEPT[:] = [maps]
 
 
-def m2(seed: int) -> tuple[dict[str, Any], list[Any], dict[str, Any], list[Any]]:
-    scene = {
-        "site": "green_bank",
-        "instrument": "mustang2",
-        "time": "2024-11-25T02:00-05:00",
-        "target": "05h +20d",
-        "seed": seed,
-    }
-    steps = [
-        zonda.PointingDaisy(
-            radius="4 arcmin", speed="50 arcsec/s", scan_duration="8.6 min", scans=2, gap="30 s",
-            offsets="box", offset_size="1 arcmin",
-        ),
-        zonda.SkyMap(file=str(CLUSTER)),
-        zonda.AtmosphereLayers(pwv="7.7 mm", pwv_rms="0.5 %"),
-        zonda.WhiteNoise(),
-        zonda.PinkNoise(shared=0.8),
-        zonda.Efficiency(),
-    ]  # fmt: skip
-    filters = [zonda.HighpassFilter(frequency="0.08 Hz"), zonda.CommonModeFilter()]
-    return scene, steps, {"pixel": "2 arcsec", "half_difference": False}, filters
-
-
-def atlast(seed: int) -> tuple[dict[str, Any], list[Any], dict[str, Any], list[Any]]:
-    scene = {
-        "site": "llano_de_chajnantor",
-        "instrument": "atlast",
-        "time": "2022-08-01T23:00",
-        "target": "260d -10d",
-        "seed": seed,
-    }
-    steps = [
-        zonda.PointingDaisy(
-            radius="0.25 deg", speed="0.5 deg/s", scan_duration="20 s", check_limits="warn"
-        ),
-        zonda.SkyMap(file=str(CLUSTER), centre="target"),
-        zonda.AtmosphereLayers(pwv_rms="5 %", highest="3000 m"),
-        zonda.WhiteNoise(),
-        zonda.PinkNoise(),
-        zonda.Efficiency(),
-    ]
-    filters = [zonda.HighpassFilter(frequency="0.5 Hz"), zonda.CommonModeFilter()]
-    return scene, steps, {"pixel": "4 arcsec", "half_difference": False}, filters
+def pipeline(kind: str, seed: int) -> tuple[zonda.Scene, list[Any], dict[str, Any], list[Any]]:
+    """Scene, steps up to the calibrated streams, parameters of the map, and filters."""
+    file = zonda.load(*PIPELINES[kind])
+    steps = [step.operator for step in file.steps]
+    end = 1 + next(k for k, step in enumerate(steps) if isinstance(step, zonda.Efficiency))
+    filters = [s for s in steps if isinstance(s, zonda.HighpassFilter | zonda.CommonModeFilter)]
+    pixel = next(step.pixel for step in steps if isinstance(step, zonda.BinMap))
+    how = {"pixel": f"{pixel} rad", "half_difference": False}
+    return file.scene().model_copy(update={"seed": seed}), steps[:end], how, filters
 
 
 SIGNALS = {"sky": {"only": ["sky"]}, "rest": {"without": ["sky"]}}
 
 
-def run(of: Any, steps: list[Any], full: bool = False, signals: Any = SIGNALS) -> Any:
+def run(scene: zonda.Scene, steps: list[Any], full: bool = False, signals: Any = SIGNALS) -> Any:
     """Products of a pipeline; ``full``: filters act as they do on the complete signal."""
     runs = {name: {**how, **({"modes": "full"} if full else {})} for name, how in signals.items()}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return zonda.Pipeline(steps, runs=runs).run(zonda.Scene(**of), threads=1)
+        return zonda.Pipeline(steps, runs=runs).run(scene, threads=1)
 
 
 class Rings:
@@ -161,11 +131,11 @@ class Rings:
 
 
 def compare(kind: str, seed: int) -> None:
-    of, steps, how, filters = {"m2": m2, "atlast": atlast}[kind](seed)
-    truth = run(of, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})["sky/map"]
-    binned = run(of, [*steps, *filters, zonda.BinMap(**how)], full=True)
+    scene, steps, how, filters = pipeline(kind, seed)
+    truth = run(scene, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})["sky/map"]
+    binned = run(scene, [*steps, *filters, zonda.BinMap(**how)], full=True)
     start = time.process_time()
-    likely = run(of, [*steps, Maker(**how)])
+    likely = run(scene, [*steps, Maker(**how)])
     seconds = time.process_time() - start
     maps = KEPT[0]
     rings, beam = Rings(truth, SCALES[kind]), BEAM[kind]
@@ -200,20 +170,20 @@ def templates(seeds: int) -> None:
     for each seed: sqrt(t^T A t), and t^T b / sqrt(t^T A t)."""
     rows = []
     for seed in range(1, seeds + 1):
-        of, steps, how, filters = m2(seed)
-        truth = run(of, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})["sky/map"]
-        run(of, [*steps, Maker(**how)])
+        scene, steps, how, _ = pipeline("m2", seed)
+        truth = run(scene, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})[
+            "sky/map"
+        ]
+        run(scene, [*steps, Maker(**how)])
         maps = KEPT[0]
         equations = maps["signal"][0]
         noise = maps["signal/rest"][1].values
-        binned = run(of, [*steps, *filters, zonda.BinMap(**how)], full=True)
         for dy, dx in ((0, 0), (30, 30), (-30, 30), (30, -30)):
             t = np.roll(np.nan_to_num(truth.signal), (dy, dx), (0, 1))
             t = t.ravel()[None] * (equations.weights[0] > 0)
             product = equations.apply(t)
             size = np.sqrt(float((t * product).sum()))
             rows.append((size, float((product * noise).sum()) / size))
-        del binned
     found = np.array(rows)
     print(
         f"template: S/N {found[:, 0].mean():.2f}, rms of {len(found)} deviates"
@@ -268,12 +238,9 @@ def survey(seed: int) -> None:
     with TemporaryDirectory() as folder:
         file = Path(folder) / "night.ecsv"
         file.write_text(SCHEDULE)
-        of = {
-            "site": "llano_de_chajnantor",
-            "instrument": LAT,
-            "time": "2025-08-01T05:12",
-            "seed": seed,
-        }
+        scene = zonda.Scene(
+            site="llano_de_chajnantor", instrument=LAT, time="2025-08-01T05:12", seed=seed
+        )
         steps = [
             zonda.PointingSchedule(
                 schedule=str(file), speed="1 deg/s", acceleration="2 deg/s2", turnaround="smooth"
@@ -285,10 +252,10 @@ def survey(seed: int) -> None:
         ]
         how = {"pixel": "3 arcmin", "stokes": "IQU", "half_difference": False}
         start = time.process_time()
-        found = run(of, [*steps, Maker(**how, baseline="0.1 s")], signals={})["map"]
+        found = run(scene, [*steps, Maker(**how, baseline="0.1 s")], signals={})["map"]
         seconds = time.process_time() - start
         filters = [zonda.PolynomialFilter(order=1)]
-        binned = run(of, [*steps, *filters, zonda.BinMap(**how)], signals={})["map"]
+        binned = run(scene, [*steps, *filters, zonda.BinMap(**how)], signals={})["map"]
     _, solution, cpu = KEPT[0]["signal"]
     samples = int(found.hits.sum())
     print(
