@@ -103,6 +103,8 @@ class Look:
         return colors.Normalize(low, high)
 
 
+BESIDE: Any = {"textcoords": "offset points", "fontsize": 8, "zorder": 5, "bbox": PALE}
+"""Style of the text at a beam or a scale bar."""
 STRETCHES = ("linear", "sqrt", "asinh", "log")
 AS_IT_IS = Look()
 
@@ -511,36 +513,19 @@ def draw_beam(ax: Any, wcs: WCS, shape: tuple[int, ...], fwhm: float) -> None:
         ax.add_patch(beam)
     else:
         half = np.zeros(2)
-    ax.annotate(
-        f"FWHM {angle_text(fwhm)}",
-        (place[0] + 2 * half[0], place[1] + half[1]),
-        xytext=(6, 0),
-        textcoords="offset points",
-        va="center",
-        fontsize=8,
-        zorder=5,
-        bbox=PALE,
-    )
+    at = place[0] + 2 * half[0], place[1] + half[1]
+    ax.annotate(f"FWHM {angle_text(fwhm)}", at, xytext=(6, 0), va="center", **BESIDE)
 
 
 def draw_scale(ax: Any, wcs: WCS, shape: tuple[int, ...], length: float) -> None:
     """Draw a bar of ``length`` [rad] on the sky in the lower right corner, with its length."""
-    ny, nx = shape
-    xx, _, _ = (float(g) for g in wcs_grid(wcs, shape).metric(0.8 * nx, 0.06 * ny))
-    if not math.isfinite(xx):
-        xx = wcs_grid(wcs, shape).middle[0]
-    end, y, size = 0.95 * nx, 0.06 * ny, length / math.sqrt(xx)
+    grid, (ny, nx) = wcs_grid(wcs, shape), shape
+    end, y = 0.95 * nx, 0.06 * ny
+    xx = float(grid.metric(0.8 * nx, y)[0])
+    size = length / math.sqrt(xx if math.isfinite(xx) else grid.middle[0])
     ax.plot([end - size, end], [y, y], color="black", linewidth=2.5, zorder=5)
-    ax.annotate(
-        angle_text(length),
-        (end - size / 2, y),
-        xytext=(0, 4),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-        zorder=5,
-        bbox=PALE,
-    )
+    text = angle_text(length)
+    ax.annotate(text, (end - size / 2, y), xytext=(0, 4), ha="center", **BESIDE)
 
 
 def circle_on_sky(grid: Any, place: Any, diameter: float, **style: Any) -> Any:
