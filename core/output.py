@@ -4,13 +4,11 @@ functions).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import PrivateAttr
 
-from .errors import InputError, OutputError
-from .maps.units import KNOWN_UNITS, Map, converted, parse_unit
-from .numerics.radiation import SURFACE_BRIGHTNESS_UNITS
+from .errors import OutputError
 from .operator import Operator
 from .signal import Signal
 from .storage.files import check_output_folder
@@ -64,43 +62,6 @@ class Output(Operator):
         """Called once the telescope is pointed, after every scan, and when all maps are made: time
         to begin, in the background, with what `finalize` will do, as far as it depends on products
         that will not change."""
-
-
-class MapOutput(Output):
-    """An output of maps, in a unit of the user's choice."""
-
-    unit: str | None = None
-    """Unit of the maps: K_RJ, K_CMB, Jy/beam, Jy/pixel, MJy/sr or y (Compton-y), with a prefix
-    (mJy/beam), at the centre of the band. The beam is the map's resolution, smoothing included.
-    Default: that of the maps, K_RJ.
-    """
-    spectral_index: float = Field(0.0, ge=-100, le=100)
-    """Slope of the flux density, S ~ frequency^index, within the band, for `unit` Jy/beam,
-    Jy/pixel and MJy/sr.
-    """
-
-    @model_validator(mode="after")
-    def _known_unit(self) -> Self:
-        try:
-            plain, _ = parse_unit(self.unit or "K_RJ", place="unit", temperature_scale="K_RJ")
-        except InputError as error:
-            raise ValueError(f"{error.message}; use {KNOWN_UNITS}") from None
-        if self.spectral_index and plain not in SURFACE_BRIGHTNESS_UNITS:
-            raise ValueError(f"spectral_index is for {', '.join(SURFACE_BRIGHTNESS_UNITS)}")
-        return self
-
-    def observe(self, data: Data) -> None:
-        """Refuse a missing or unwritable output folder before anything is simulated."""
-        output_folder(data, self.label)
-
-    def in_unit(self, product: Map) -> Map:
-        """The map in `unit`. Raises InputError where it cannot be converted."""
-        if self.unit is None:
-            return product
-        try:
-            return converted(product, self.unit, self.spectral_index)
-        except InputError as error:
-            raise InputError(error.message, place=self.label, cure=error.cure) from None
 
 
 class StreamOutput(Operator):

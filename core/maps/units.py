@@ -1,4 +1,6 @@
-"""Units of maps of the sky, as headers write them and people type them; maps in other units."""
+"""Units of maps of the sky, as headers write them and people type them; maps in other units, and
+outputs of such maps.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,17 @@ import math
 import re
 import unicodedata
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 from astropy.units import UnitBase
+from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from ..configuration.units import Unit, read_unit
+from ..data import Data
 from ..errors import InputError
 from ..numerics.radiation import SURFACE_BRIGHTNESS_UNITS, to_kelvin_rj
+from ..output import Output, output_folder
 from ..types import Floats
 from .map_arrays import MapArrays
 
@@ -239,3 +244,40 @@ def scale_of(unit: str) -> tuple[str, str]:
     """
     plain, _, scale = unit.partition("_")
     return (plain, f"K_{scale}") if scale else (unit, "")
+
+
+class MapOutput(Output):
+    """An output of maps, in a unit of the user's choice."""
+
+    unit: str | None = None
+    """Unit of the maps: K_RJ, K_CMB, Jy/beam, Jy/pixel, MJy/sr or y (Compton-y), with a prefix
+    (mJy/beam), at the centre of the band. The beam is the map's resolution, smoothing included.
+    Default: that of the maps, K_RJ.
+    """
+    spectral_index: float = Field(0.0, ge=-100, le=100)
+    """Slope of the flux density, S ~ frequency^index, within the band, for `unit` Jy/beam,
+    Jy/pixel and MJy/sr.
+    """
+
+    @model_validator(mode="after")
+    def _known_unit(self) -> Self:
+        try:
+            plain, _ = parse_unit(self.unit or "K_RJ", place="unit", temperature_scale="K_RJ")
+        except InputError as error:
+            raise ValueError(f"{error.message}; use {KNOWN_UNITS}") from None
+        if self.spectral_index and plain not in SURFACE_BRIGHTNESS_UNITS:
+            raise ValueError(f"spectral_index is for {', '.join(SURFACE_BRIGHTNESS_UNITS)}")
+        return self
+
+    def observe(self, data: Data) -> None:
+        """Refuse a missing or unwritable output folder before anything is simulated."""
+        output_folder(data, self.label)
+
+    def in_unit(self, product: Map) -> Map:
+        """The map in `unit`. Raises InputError where it cannot be converted."""
+        if self.unit is None:
+            return product
+        try:
+            return converted(product, self.unit, self.spectral_index)
+        except InputError as error:
+            raise InputError(error.message, place=self.label, cure=error.cure) from None

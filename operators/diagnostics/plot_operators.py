@@ -38,9 +38,9 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import Noise, maps_of, noise_alone, noise_sources
 from zonda.core.maps.planes import central_diameter, in_beams
 from zonda.core.maps.smoothing import smoother
-from zonda.core.maps.units import parse_unit
+from zonda.core.maps.units import MapOutput, parse_unit
 from zonda.core.numerics.sphere import angle_text, sides_text
-from zonda.core.output import MapOutput, output_folder
+from zonda.core.output import output_folder
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.types import AnyFloats, Floats
 

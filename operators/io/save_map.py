@@ -22,7 +22,8 @@ from zonda.core.maps.noise_figures import (
     noise_stated,
 )
 from zonda.core.maps.planes import Plane
-from zonda.core.output import MapOutput, output_folder
+from zonda.core.maps.units import MapOutput
+from zonda.core.output import output_folder
 from zonda.core.storage.files import MOST_AT_ONCE, product_path
 from zonda.core.storage.fits_files import header_of
 
