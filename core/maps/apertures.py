@@ -221,7 +221,7 @@ def aperture_flux(
         hasattr(ring, "__len__") and not isinstance(ring, str) and len(ring) == 2
     )
     sizes = [angle_of(each, call) for each in (radius, *(ring if pair else ()))]
-    if not pair or sizes != sorted(sizes) or sizes[1:2] == sizes[2:] != []:
+    if not pair or sizes != sorted(sizes) or len(set(sizes[1:])) == 1:
         wrong = "annulus has an inner and an outer radius: radius <= inner < outer"
         raise InputError(wrong, place="map.aperture_flux", cure=f"write {call}")
     try:

@@ -123,10 +123,9 @@ class _Reader(FileHeader):
         beside = [h for h in self.hdus if h is not self.hdu and h.is_image and h.shape == shape]
         if all_of_them and len(shape) == 2:
             names = [h.name.lower() for h in beside]
-            names = [
-                dict(zip(q_and_u(names), "qu", strict=False)).get(k, n) for k, n in enumerate(names)
-            ]
-            for name, other in zip(names, beside, strict=True):
+            letters = dict(zip(q_and_u(names), "qu", strict=False))
+            for k, other in enumerate(beside):
+                name = letters.get(k, names[k])
                 about = FileHeader(other.header, self.place)
                 self.rows.setdefault(name or "i", (_native(other.data), about.text("BUNIT")))
         grid = wcs_grid(wcs, shape[-2:])
@@ -160,8 +159,7 @@ class _Reader(FileHeader):
             plain |= dict(zip(q_and_u(names), "qu", strict=False))
         first = min(plain, key=lambda k: plain[k] != "i")
         columns = {plain[k]: k for k in sorted(plain, key=lambda k: k != first)}
-        values, pixels, nside = table.read({"I": first, **columns})
-        values.pop("I")
+        values, pixels, nside = table.read(columns)
         for name, k in columns.items():
             whole = self.hdu.columns[k].format[-1:] in "IJK"
             unit = str(self.header.get(f"TUNIT{k + 1}", "") or "").strip()

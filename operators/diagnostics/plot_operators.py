@@ -397,7 +397,9 @@ class Plots(MapOutput):
         return []
 
     def observe(self, data: Data) -> None:
-        """Refuse a missing or unwritable output folder before anything is simulated."""
+        """Refuse an unwritable output folder, and colours that there are not, before anything is
+        simulated.
+        """
         super().observe(data)
         self.check(data)
 

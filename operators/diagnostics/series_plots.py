@@ -33,8 +33,8 @@ from .transfer_function import Transfer
 if TYPE_CHECKING:
     from zonda.core.data import Observation
 
-NOTHING_THERE = 2.0
-"""S from which a ring of a transfer function holds what filters brought from other scales: a filter
+LARGEST_RATIO = 2.0
+"""S of a ring of a transfer function above which its power was brought from other scales: a filter
 does not double amplitudes.
 """
 MODES = 4
@@ -173,13 +173,13 @@ def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
     ratio of amplitudes.
 
     Rings are left out where the sky has no power beside what the filters bring from other scales
-    (S above `NOTHING_THERE`, or none at all). Horizontal bars are the rings. The dotted line is the
+    (S above `LARGEST_RATIO`, or none at all). Horizontal bars are the rings. The dotted line is the
     beam's FWHM; the upper axis counts wavelengths.
     """
     ax = new_axes(size=(7.2, 5.0), above=0.9)
     r = transfer.rings
     scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
-    known = r.amplitude <= NOTHING_THERE  # and no NaN
+    known = r.amplitude <= LARGEST_RATIO  # and no NaN
     width = np.stack([np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)])[:, known]
     style: dict[str, Any] = {"fmt": "o", "markersize": 4, "label": "T: share in phase"}
     error, shown = np.nan_to_num(r.error[known]), (r.transfer[known], r.amplitude[known])
