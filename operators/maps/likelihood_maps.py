@@ -1,0 +1,176 @@
+"""Maximum-likelihood maps of the signals: noise of data minus the map, solutions, and what is taken
+off them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from zonda.core.data import Data
+from zonda.core.maps.map_product import MapProduct
+from zonda.core.signal import MAIN
+from zonda.core.types import Floats
+
+from .baseline_noise import estimate
+from .intensity_kernel import VALUE
+from .likelihood_parameters import LikelihoodParameters
+from .map_from_sums import MapFromSums
+from .normal_equations import (
+    CompressedScans,
+    NormalEquations,
+    Solution,
+    WeighedScan,
+)
+
+MOST_ITERATIONS = 1000
+"""Of conjugate gradients."""
+
+
+@dataclass(frozen=True)
+class LikelihoodMaps(MapFromSums):
+    """Maps of the signals, from sums in pixels and compressed scans."""
+
+    parameters: LikelihoodParameters
+    scans: CompressedScans
+    data: Data
+
+    def map_of(self, stream: str) -> MapProduct:
+        """The map of a signal; its weights and its noise are those of white noise. Without filters
+        it is the mean of the samples, of which the same is taken off.
+        """
+        product, equations = super().map_of(stream), self.equations
+        mean = stream not in self.scans.scans[0].data
+        if mean:
+            rows = np.nan_to_num(product.planes["signal"].values)
+            values = np.zeros((len(rows), self.grid.n_pixels))
+            values[:, self._seen] = rows.reshape(len(rows), -1)
+            signal = self._determined(values, equations, product)
+            return replace(
+                product.with_planes(signal=self._rows(product, signal)), taken_off=self._taken
+            )
+        solution = self._solved(equations, stream)
+        planes = {
+            "signal": self._rows(product, self._determined(solution.values, equations, product))
+        }
+        if self.halves:
+            (one, first), (two, second) = (self._half(stream, k, product) for k in range(2))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.sqrt(equations.spread / (first.spread + second.spread))
+                values = np.where(
+                    (first.spread > 0) & (second.spread > 0), (one - two) * share, np.nan
+                )
+            planes["half_difference"] = self._rows(product, values)
+        if stream == MAIN:
+            self._tell(solution)
+        made = product.with_planes(**planes)
+        return replace(made, noise_from="streams", taken_off=self._taken)
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        """Normal equations of all scans, with the noise of data minus the map."""
+        found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
+        step = self.parameters
+        for _ in range(step.refine):
+            m = self._solved(found, self.sums.first).values
+            scans = []
+            for one, (scan, noise) in zip(self.scans.scans, found.scans, strict=True):
+                y = one.data[self.sums.first][0] - scan.seen(m, np.zeros((0, len(noise.white))))[0]
+                new = estimate(
+                    y,
+                    scan.counted,
+                    noise.white,
+                    scan.length,
+                    scan.rate,
+                    modes=step.modes,
+                    free=step.free,
+                    trend=step.trend,
+                    fixed=noise.modes[: noise.free],
+                )
+                scans.append(WeighedScan(scan, new))
+            found = self._of(scans)
+        return found
+
+    def _of(self, scans: Sequence[WeighedScan]) -> NormalEquations:
+        n_stokes = 3 if self.sums.polarized else 1
+        return NormalEquations(scans, n_stokes, self.grid.n_pixels, self.data.threads)
+
+    def _solved(
+        self,
+        equations: NormalEquations,
+        stream: str,
+        half: int | None = None,
+    ) -> Solution:
+        """The solution for a signal, of all scans or of half of them."""
+        binned = self.sums.in_pixels(stream, slice(None), half).data.T / VALUE
+        scans = self.scans.scans if half is None else self.scans.scans[half::2]
+        data = [one.data[stream] for one in scans]
+        right = equations.right_side(binned / self.layout["variance"], data)
+        return equations.solve(right, self.parameters.tolerance, MOST_ITERATIONS)
+
+    def _half(self, stream: str, half: int, product: MapProduct) -> tuple[Floats, NormalEquations]:
+        """The map of the even or odd scans, and their equations."""
+        equations = self._of(self.equations.scans[half::2])
+        values = self._solved(equations, stream, half).values
+        return self._determined(values, equations, product), equations
+
+    @property
+    def _seen(self) -> Any:
+        """Places of the pixels that the product has."""
+        return self.grid.seen(self.sums.hits.any(axis=0))
+
+    @property
+    def _taken(self) -> str:
+        """`taken_off`, as products state it."""
+        return self.parameters.taken_off.removeprefix("none")
+
+    def _determined(
+        self,
+        values: Floats,
+        equations: NormalEquations,
+        product: MapProduct,
+    ) -> Floats:
+        """A map without what the data hardly determine, as fitted to pixels with values."""
+        values, weight = values.copy(), np.zeros(self.grid.n_pixels)
+        weight[self._seen] = np.where(
+            product.known, equations.weights[0][self._seen].reshape(product.hits.shape), 0.0
+        ).ravel()
+        if self.parameters.taken_off == "none":
+            return values
+        patterns = [np.ones(self.grid.n_pixels)]
+        if self.parameters.taken_off == "plane":
+            rows, columns = np.indices(self.grid.shape)
+            patterns += [rows.ravel() - rows.mean(), columns.ravel() - columns.mean()]
+        basis = np.array(patterns) * np.sqrt(weight)
+        matrix = np.einsum("ip,jp->ij", basis, basis)
+        right = np.einsum("ip,p->i", basis, values[0] * np.sqrt(weight))
+        values[0] -= np.einsum("i,ip->p", np.linalg.lstsq(matrix, right)[0], np.array(patterns))
+        return values
+
+    def _rows(self, product: MapProduct, values: Floats) -> Floats:
+        """Rows in the shape of the map, NaN where there is no value."""
+        shaped = values[:, self._seen].reshape(len(values), *product.hits.shape)
+        return np.where(product.known, shaped, np.nan)
+
+    def _tell(self, solution: Solution) -> None:
+        """Log how the solution was found."""
+        log, label, step = self.data.log, self.parameters.label, self.parameters
+        log.state(label, "iterations", str(len(solution.history)))
+        if solution.history:
+            least = min(solution.history)
+            log.state(label, "residual over right side", f"{least:.1e}")
+            log.state(label, "smallest Ritz value", f"{solution.ritz[0]:.1e}")
+            if least >= step.tolerance:
+                warnings.warn(
+                    f"{label}: after {len(solution.history)} iterations the residual is"
+                    f" {least:.1e} of the right side, not {step.tolerance:g}",
+                    stacklevel=4,
+                )
+        if step.taken_off != "none":
+            log.state(label, "taken off the map of I", f"its weighted {step.taken_off}")
+        log.state(label, "noise of a pixel", "white noise alone, as found in the streams")

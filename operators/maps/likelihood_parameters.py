@@ -1,0 +1,53 @@
+"""Parameters of `MaximumLikelihoodMap`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from zonda.core.configuration.parameters import quantity
+from zonda.core.configuration.units import Seconds
+
+from .parameters import MapParameters
+
+
+class LikelihoodParameters(MapParameters):
+    """Noise model, iteration, and what is taken off."""
+
+    baseline: Seconds = quantity("0.2 s", gt=0)
+    """Length of a baseline: noise is white within it, but for the free modes."""
+    modes: int = Field(3, ge=0, le=20)
+    """Modes that detectors share, each with a spectrum of its own. 0: baselines of independent
+    detectors (destriping with a noise prior)."""
+    free: int = Field(1, ge=0, le=20)
+    """How many of the modes have no weight at any frequency, within baselines too."""
+    trend: int = Field(1, ge=0, le=10)
+    """Degree of the polynomial of each detector's scan that is taken off."""
+    refine: int = Field(1, ge=0, le=5)
+    """How often noise is estimated again, from data minus the map."""
+    tolerance: float = Field(1e-4, gt=0, lt=0.1)
+    """Norm of the residual at which the iteration ends, over that of the right side."""
+    undetermined: Literal["none", "mean", "plane"] | None = None
+    """What is taken off the map of I, weighted by its hits, since the data hardly determine it;
+    where absent, a plane of a TAN image, the mean of other maps."""
+
+    @model_validator(mode="after")
+    def _of_likelihood(self) -> LikelihoodParameters:
+        if self.free > self.modes:
+            raise ValueError(f"free: {self.free} of {self.modes} modes; set modes to {self.free}")
+        if self.contents == "hits" or self.weights == "uniform" or self.noise == "scatter":
+            raise ValueError(
+                "contents: hits, weights: uniform and noise: scatter belong to BinMap: these maps"
+                " are weighted by the noise that is found in the streams"
+            )
+        if self.split != "scans":
+            raise ValueError("half_difference is that of even and odd scans; write true or scans")
+        if self.undetermined == "plane" and self.kind != "TAN":
+            raise ValueError("undetermined: plane is for TAN images; choose none or mean")
+        return self
+
+    @property
+    def taken_off(self) -> Literal["none", "mean", "plane"]:
+        """The name of the pattern that is taken off the map of I."""
+        return self.undetermined or ("plane" if self.kind == "TAN" else "mean")

@@ -1,0 +1,210 @@
+"""One observation of a maximum-likelihood map: what the readings of its streams add up."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from zonda.core.data import Block, Observation, Stream
+from zonda.core.errors import PipelineError
+from zonda.core.numerics.chunks import TILE_SAMPLES
+from zonda.core.signal import MAIN
+from zonda.core.types import AnyFloats, Floats
+
+from .bin_map import Prepared
+from .binning import Weights, binnings
+from .compressed_scan import CompressedScan, RunsOfTiles, Tile, add_baselines
+from .intensity_kernel import VALUE, WEIGHT
+from .normal_equations import (
+    Compressed,
+)
+
+LOCK = threading.Lock()
+"""Held while a thread adds to the sums of a scan."""
+
+
+@dataclass
+class LikelihoodScan:
+    """One observation: what `measure` finds, and the sums that `exec` adds to.
+
+    Attributes
+    ----------
+    prepared
+        Sums in pixels.
+    length
+        Samples of a baseline.
+    rows
+        (n,) the good detectors.
+    baselines, common
+        By signal, fixed-point sums of baselines (n, n_base) and free modes (free, n_samp).
+    """
+
+    prepared: Prepared
+    length: int
+    observation: Observation
+    rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    baselines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    common: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    found: Any = None
+    noise: Any = None
+
+    @property
+    def looking(self) -> Any:
+        """Pointing of the detectors."""
+        return self.prepared.halves[0][0].looking
+
+    @property
+    def nowhere(self) -> int:
+        """Number of the pixel of samples that do not count."""
+        return int(self.looking.grid.n_pixels)
+
+    def pixels(
+        self,
+        which: NDArray[np.intp],
+        start: int,
+        stop: int,
+        *signals: AnyFloats,
+    ) -> NDArray[np.int32]:
+        """(n, stop - start) pixels of detectors, -1 of samples that do not count."""
+        found: NDArray[np.int32] = self.looking.pixels(which, start, stop)
+        found[:, self.prepared.halves[0][0].samples[start:stop] == 0] = -1
+        for signal in signals:
+            found[~np.isfinite(signal)] = -1
+        return found
+
+    def compress(self, stream: Stream, place: str) -> None:
+        """Find runs and baselines of the complete signal, in one reading."""
+        observation, mean = stream.observation, stream.means.get(MAIN)
+        self.rows = np.flatnonzero(observation.good_detectors)
+        if not self.rows.size:
+            raise PipelineError(
+                "no detector is good", place=f"{place}, {observation.name}", cure="look at the log"
+            )
+        self.found = RunsOfTiles(self.rows.size, observation.n_samples, self.length)
+        angles = self.prepared.halves[0][0].angles
+        single = observation.hwp_angle is not None
+        efficiency = observation.focalplane.polarization_efficiency
+
+        def tiles(detectors: slice, samples: slice, part: AnyFloats) -> list[Any]:
+            which = self.rows[(self.rows >= detectors.start) & (self.rows < detectors.stop)]
+            made: list[Any] = []
+            for start in range(samples.start, samples.stop, TILE_SAMPLES):
+                stop = min(start + TILE_SAMPLES, samples.stop)
+                here = slice(start - samples.start, stop - samples.start)
+                signal = np.asarray(part[which - detectors.start, here], np.float64)
+                if mean is not None:
+                    whole = mean.evaluate(detectors, slice(start, stop))
+                    signal += whole[which - detectors.start]
+                cosine, sine = np.zeros((2, which.size, 0 if angles is None else stop - start))
+                if angles is not None:
+                    angles.fill(which, start, cosine, sine)
+                    cosine *= efficiency[which, None]
+                    sine *= efficiency[which, None]
+                pixel = self.pixels(which, start, stop, signal)
+                made.append(
+                    Tile.of(signal, pixel, start, self.length, self.nowhere, cosine, sine, single)
+                )
+            return [np.searchsorted(self.rows, which), *made]
+
+        for _, _, (rows, *made) in stream.sweep(tiles):
+            for tile in made:
+                self.found.add(rows, tile)
+
+    def white(self, place: str) -> Floats:
+        """(n,) variance of white noise; the median of the others for detectors without samples.
+
+        Raises PipelineError where there is none. Warns of detectors that lack samples which others
+        have.
+        """
+        observation, white = self.observation, np.asarray(self.found.scatter)
+        place = f"{place}, {observation.name}"
+        if np.isnan(white).all():
+            raise PipelineError("no samples count", place=place, cure="look at the log")
+        if (white <= 0).any():
+            name = observation.focalplane.names[self.rows[np.flatnonzero(white <= 0)[0]]]
+            raise PipelineError(
+                f"detector {name} has no noise",
+                place=place,
+                cure="add WhiteNoise, or make the map with BinMap",
+            )
+        number = self.found.counted.sum(axis=1)
+        less = (number > 0) & (number < 0.99 * number.max())
+        if less.any():
+            warnings.warn(
+                f"{place}: {int(less.sum())} detectors lack up to"
+                f" {100 * (1 - number[less].min() / number.max()):.2g} % of the samples that others"
+                " have: what detectors share stays in the map there; fill these gaps, or flag these"
+                " detectors",
+                stacklevel=4,
+            )
+        return np.where(np.isnan(white), np.nanmedian(white), white)
+
+    def give_weights(self, reference: float, spare: Any) -> None:
+        """Weigh detectors by the white level that was found, in units of the inverse variance
+        ``reference``, K^2.
+        """
+        observation, first = self.observation, self.prepared.halves[0][0]
+        weight = np.ones(observation.n_detectors)
+        rounded = np.rint(reference / self.noise.white * WEIGHT) / WEIGHT
+        weight[self.rows] = rounded
+        self.noise = replace(self.noise, white=reference / rounded)
+        made = binnings(
+            "scans",
+            self.looking,
+            Weights(weight, weight.copy(), np.zeros(0)),
+            first.samples.astype(bool),
+            spare,
+            signals=first.signals.stop - first.signals.start,
+            polarized=first.angles is not None,
+        )
+        self.prepared = replace(self.prepared, halves=made)
+        scan: CompressedScan = self.found.scan(observation.sample_rate)
+        self.found = scan
+        for name in sorted({*observation.signals} - observation.unfiltered):
+            self.baselines[name] = np.zeros(scan.shape, np.int64)
+            self.common[name] = np.zeros(
+                (len(self.noise.free_modes), observation.n_samples), np.int64
+            )
+
+    def add(self, block: Block) -> None:
+        """Add a block to the sums of baselines and free modes."""
+        begin, end = np.searchsorted(self.rows, [block.detectors.start, block.detectors.stop])
+        which = self.rows[begin:end]
+        a = self.scale * self.noise.free_modes[:, begin:end]
+        signals = self.prepared.signals(block)
+        rows = which - block.detectors.start
+        for start in range(block.samples.start, block.samples.stop, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, block.samples.stop)
+            here = slice(start - block.samples.start, stop - block.samples.start)
+            parts = [signal[rows, here] for signal in signals]
+            pixel = self.pixels(which, start, stop, *parts)
+            base = slice(start // self.length, (stop - 1) // self.length + 1)
+            for name, part in zip(block.signals, parts, strict=True):
+                if name not in self.baselines:
+                    continue
+                y = np.zeros((which.size, base.stop - base.start), np.int64)
+                s = np.zeros((len(a), stop - start), np.int64)
+                add_baselines(part, pixel, start, self.length, a, VALUE, y, s)
+                with LOCK:
+                    self.baselines[name][begin:end, base] += y
+                    self.common[name][:, start:stop] += s
+
+    @property
+    def scale(self) -> float:
+        """Unit of the sums of free modes, K: they fit in 63 bits."""
+        return float(np.sqrt(self.noise.white.min()))
+
+    def compressed(self) -> Compressed:
+        """The scan without its observation."""
+        data = {}
+        scan, a = self.found, self.noise.free_modes
+        for name, sums in self.baselines.items():
+            y = sums / VALUE / np.maximum(scan.counted, 1)
+            s = self.common[name] / (VALUE * self.scale)
+            data[name] = (y, scan.about_means(s, y, a, self.nowhere))
+        return Compressed(scan, self.noise, data)
