@@ -42,7 +42,7 @@ operators:
   - Plots
   - Report
 """
-SCAN = 217 * 200 * 8
+SCAN = 223 * 200 * 8
 """Bytes of a scan's signal: MUSTANG-2's detectors, 2 s at 100 Hz, float64."""
 INPUTS = {"p.yaml", "map.fits", "small.yaml", "zonda-files.jsonl"}
 ZONDA = [sys.executable, "-m", "zonda"]
@@ -210,7 +210,7 @@ def test_streams_that_do_not_fit_the_folder_for_temporary_files(
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     store = Store(Settings(memory=1000))
     with pytest.raises(OutputError, match="No space left") as caught:
-        store.allocate("signal", (217, 1000))
+        store.allocate("signal", (223, 1000))
     assert str(tmp_path) in str(caught.value)
     assert "TMPDIR" in caught.value.cure
     store.close()
@@ -228,9 +228,9 @@ def test_spilled_streams_have_their_blocks_from_the_start(
 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     store = Store(Settings(memory=1000))
-    array = store.allocate("signal", (217, 1000))
+    array = store.allocate("signal", (223, 1000))
     assert isinstance(array, np.memmap)
-    assert array.shape == (217, 1000)
+    assert array.shape == (223, 1000)
     (path,) = [p for p in tmp_path.rglob("*") if p.is_file()]
     assert path.stat().st_blocks * 512 >= array.nbytes == path.stat().st_size
     store.close()

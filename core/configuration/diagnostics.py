@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import PydanticCustomError, core_schema
 
-from ..errors import ZondaError
+from ..errors import InputError, ZondaError
 from .yaml_places import Span
 
 
@@ -66,6 +66,12 @@ def mistake(
     """
     context = {"message": message, "label": label, "help": help, "caret": caret, "at": at}
     return PydanticCustomError("mistake", "{message}", context)
+
+
+def input_error(err: PydanticCustomError, place: str, cure: str = "") -> InputError:
+    """Error about a value that is not in a pipeline; its own hint stands before the cure."""
+    hint = (err.context or {}).get("label", "")
+    return InputError(err.message(), place=place, cure="\n".join(filter(None, [hint, cure])))
 
 
 def refusal(err: ZondaError, at: tuple[str | int, ...] = ()) -> PydanticCustomError:

@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from pydantic_core import PydanticCustomError
 
+from ..configuration.diagnostics import input_error
 from ..configuration.target import Target
 from ..errors import InputError
 from ..numerics.sphere import angle_text, angles, local_axes, unit_vectors
@@ -227,7 +228,7 @@ def aperture_flux(
     try:
         where = None if centre is None else in_frame(product, Target.parse(centre))
     except PydanticCustomError as err:
-        raise InputError(err.message(), place="map.aperture_flux, centre") from None
+        raise input_error(err, "map.aperture_flux, centre") from None
     half = product.half_difference
     alone = None if half is None else (half, f"half the difference, {product.difference}")
     return flux_within(product, Aperture(*sizes), where, alone, spectral_index)

@@ -14,6 +14,7 @@ from astropy.units import UnitBase
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from ..configuration.diagnostics import input_error
 from ..configuration.units import Unit, read_unit
 from ..data import Data
 from ..errors import InputError
@@ -85,7 +86,7 @@ def angle_of(given: Any, call: str) -> float:
     try:
         angle = Unit("rad").parse(given)
     except PydanticCustomError as err:
-        raise InputError(err.message(), place=place, cure=cure) from None
+        raise input_error(err, place, cure) from None
     if not angle > 0:
         raise InputError(f"{given} is no angle above 0", place=place, cure=cure)
     return angle

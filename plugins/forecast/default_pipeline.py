@@ -23,6 +23,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from zonda.core import registry
+from zonda.core.configuration.diagnostics import input_error
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Unit
@@ -336,4 +337,4 @@ def parsed(place: str, parse: Callable[[Any], T], given: str) -> T:
     try:
         return parse(given)
     except PydanticCustomError as err:
-        raise InputError(err.message(), place=place) from None
+        raise input_error(err, place) from None

@@ -347,24 +347,22 @@ NAMES = {
 
 def report(each: Sequence[Sensitivity], wanted: str | None = None) -> str:
     """Text of forecasts of all bands: header, table, errors; when a depth or ``5 sigma`` is reached
-    if that is ``wanted``. All times are in one unit.
+    if that is ``wanted``. The times of tables are in one unit.
     """
-    needed = [] if wanted is None else [
-        one.reach(wanted, of=of) for one in each for of in (OF if sigmas(wanted) else OF[:1])
-    ]  # fmt: skip
-    unit = unit_of(max([one.seconds for one in each] + [t for t in needed if math.isfinite(t)]))
+    unit = unit_of(max(one.seconds for one in each))
     parts = [_text(one, unit) for one in each]
-    parts += [_reached(one, wanted, unit) for one in each if wanted is not None]
+    parts += [_reached(one, wanted) for one in each if wanted is not None]
     if wanted is not None and len(each) > 1:
-        longest = duration(max(one.reach(wanted) for one in each), unit)
-        parts.append(f"{wanted} in all bands after {longest} of integration")
+        longest = max(one.reach(wanted) for one in each)
+        time = duration(longest, unit_of(longest))
+        parts.append(f"{wanted} in all bands after {time} of integration")
     return "\n\n".join(parts)
 
 
 def _text(found: Sensitivity, unit: str) -> str:
     source = found.source
     about = [noise_alone(found)] if source is None else source.lines(found.factors)
-    parts = [_header(found, unit), about]
+    parts = [_header(found), about]
     for plane, depth in found.planes.items():
         parts.append(([plane] if found.polarization else []) + _table(found, depth, unit))
     parts.append(_errors(found))
@@ -393,8 +391,9 @@ def noise_alone(found: Sensitivity) -> str:
     )
 
 
-def _header(found: Sensitivity, unit: str) -> list[str]:
+def _header(found: Sensitivity) -> list[str]:
     survey, count = found.survey, len(found.survey.observations)
+    whole = float(found.depth.seconds[-1])
     low, high = (math.degrees(e) for e in elevations(survey))
     water = ", no atmosphere"
     if (step := survey.atmosphere) is not None:
@@ -409,7 +408,7 @@ def _header(found: Sensitivity, unit: str) -> list[str]:
     filters += ["common mode"] if survey.common else []
     return [
         f"{found.file.header.name}: {found.camera} at {survey.scene.site.name}, {count}"
-        f" scan{'s' if count > 1 else ''}, {duration(float(found.depth.seconds[-1]), unit)} in all,"
+        f" scan{'s' if count > 1 else ''}, {duration(whole, unit_of(whole))} in all,"
         f" from {survey.observations[0].start}",
         f"elevation {low:.1f} to {high:.1f} deg{water}",
         f"filters: {', '.join(filters) or 'none'}",
@@ -468,7 +467,7 @@ def _errors(found: Sensitivity) -> list[str]:
     ]
 
 
-def _reached(found: Sensitivity, wanted: str, unit: str) -> str:
+def _reached(found: Sensitivity, wanted: str) -> str:
     """The integration time that reaches a depth, of a map of I, Q and U in each, and the kinds of
     noise that make it up; or a signal-to-noise ratio, of the peak and of the template.
     """
@@ -483,6 +482,7 @@ def _reached(found: Sensitivity, wanted: str, unit: str) -> str:
         low, high = ((1 + sign * error) ** 2 * seconds for sign in (-1, 1))
         before = [f"band {found.band}"] * bool(found.band) + [plane] * bool(found.polarization)
         what = f"{wanted} of the {of}" if sigma else wanted
+        unit = unit_of(seconds)
         lines.append(
             f"{': '.join([*before, what])} after {duration(seconds, unit)} of integration,"
             f" {duration(low, unit)} to {duration(high, unit)} by the stated errors"
@@ -493,7 +493,7 @@ def _reached(found: Sensitivity, wanted: str, unit: str) -> str:
     if seconds > (end := float(found.depth.seconds[-1])):
         lines.append(
             "  white and 1/f noise fall as time^-1/2; the atmosphere is forecast for the first"
-            f" {duration(end, unit)} and taken to do so too"
+            f" {duration(end, unit_of(end))} and taken to do so too"
         )
     return "\n".join(lines)
 

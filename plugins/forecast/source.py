@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from pydantic_core import PydanticCustomError
 from scipy.ndimage import correlate1d
 
+from zonda.core.configuration.diagnostics import input_error
 from zonda.core.configuration.input_paths import find_in
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
@@ -156,7 +157,7 @@ class Source(NamedTuple):
             try:
                 found = SkyMap(file=find_in(None, self.text))
             except PydanticCustomError as err:
-                raise InputError(err.message(), place=PLACE, cure=f"write {FORMS}") from None
+                raise input_error(err, PLACE, f"write {FORMS}") from None
             try:
                 source = found.read_input()
             except InputError as err:
