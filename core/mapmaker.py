@@ -27,9 +27,13 @@ class MapMaker(Operator):
 
     Where it is `linear`, the product of a remainder is subtracted
     (`core.product.Product.subtract`), not simulated. With `all_bands` it has `exec_bands`.
+
+    Where it is `unfiltered`, steps that remove something of signals (`removes`) are refused before
+    it.
     """
 
     averages: ClassVar[bool] = True
+    unfiltered: ClassVar[bool] = False
 
     def exec_bands(self, blocks: Sequence[Block], states: Sequence[Any]) -> None:
         """Act on the blocks of several bands, of the same detectors and samples, each with what
@@ -152,6 +156,13 @@ def forms(operator: Operator) -> bool:
 def filters(operator: Operator) -> bool:
     """Tell whether a step changes signals."""
     return MAIN in operator.provides and MAIN in operator.requires
+
+
+def removes(operator: Operator) -> bool:
+    """Tell whether a step removes something of signals, by what it declares: it depends on whole
+    scans, or handles means, as steps do that remove them. Instruments' effects do neither.
+    """
+    return filters(operator) and (operator.couples in ("time", "all") or operator.knows_means)
 
 
 def changes_components(operator: Operator) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..configuration.diagnostics import nearest
-from ..mapmaker import changes_components, forms, place_of_signal
+from ..mapmaker import MapMaker, changes_components, forms, place_of_signal, removes
 from ..operator import Operator
 from ..output import Output
 from ..registry import makers
@@ -80,6 +80,12 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                     "it must require exactly one",
                 )
             )
+        taking = [type(o).__name__ for o in operators[:index] if removes(o)]
+        if taking and isinstance(operator, MapMaker) and operator.unfiltered:
+            names = " and ".join(dict.fromkeys(taking))
+            message = f"{name} needs streams that no filter has changed, not those behind {names}"
+            cure = f"move {name} above {taking[0]}, or leave {names} out"
+            problems.append(OrderProblem(index, message, "what a filter removes is lost", cure))
         read = next((type(o).__name__ for o in operators[:index] if isinstance(o, WithScene)), None)
         if (
             read

@@ -55,6 +55,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
     all_bands: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     averages: ClassVar[bool] = False
+    unfiltered: ClassVar[bool] = True
 
     _samples: tuple[int, int] = PrivateAttr((0, 0))
 

@@ -12,6 +12,7 @@ import zonda.pipelines
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.polarization import PolarizationAngles
+from zonda.core.registry import operators_that
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import Looking
 from zonda.operators.maps.maximum_likelihood import MaximumLikelihoodMap
@@ -277,20 +278,63 @@ def test_parameters_that_do_not_go_together(how, place):
         MaximumLikelihoodMap(**how)
 
 
-def test_streams_that_a_filter_has_changed_are_refused():
+POINTED = [zonda.PointingDaisy(radius="3 arcmin", speed="50 arcsec/s", scan_duration="50 s")]
+FORMED = [*POINTED, zonda.WhiteNoise(), zonda.Efficiency()]
+SHIPPED = [
+    zonda.CommonModeFilter(),
+    zonda.Despline(),
+    zonda.Detrend(),
+    zonda.GroundFilter(),
+    zonda.HighpassFilter(),
+    zonda.PolynomialFilter(),
+    zonda.Taper(),
+    zonda.operator(lambda block: None, couples="time"),
+]
+EFFECTS = [
+    zonda.Crosstalk(),
+    zonda.GainDrift(),
+    zonda.TimeConstant(tau="10 ms"),
+    zonda.operator(lambda block: None),
+]
+
+
+@pytest.mark.parametrize("step", SHIPPED, ids=lambda step: type(step).__name__)
+def test_what_removes_a_part_of_the_signal_is_refused_before_the_map(step):
+    maker = MaximumLikelihoodMap(pixel="10 arcsec")
+    with pytest.raises(PipelineError, match=f"behind {type(step).__name__}") as caught:
+        zonda.Pipeline([*FORMED, step, maker])
+    assert "leave" in caught.value.cure
+    assert zonda.Pipeline([*FORMED, maker, step, BinMap(pixel="10 arcsec")])
+
+
+def test_no_filter_is_missing_above():
+    """Every shipped step that reads and changes the signal is a filter or an effect above."""
+    every = {type(step).__name__ for step in (*SHIPPED, *EFFECTS)}
+    # refused too, but it needs TOAST
+    assert set(operators_that(changes)) - every == {"ToastOperator"}
+
+
+def changes(cls):
+    """Tell whether a class of zonda's own says that it changes signals."""
+    streams = cls.requires, cls.provides
+    own = cls.__module__.startswith("zonda.")
+    return own and all(isinstance(names, frozenset) and "signal" in names for names in streams)
+
+
+@pytest.mark.parametrize("step", EFFECTS, ids=lambda step: type(step).__name__)
+def test_effects_of_the_instrument_stand_before_the_map(step):
+    assert zonda.Pipeline([*FORMED, step, MaximumLikelihoodMap(pixel="10 arcsec")])
+
+
+def test_recorded_streams_that_lack_slow_noise_are_refused():
+    """A step tells of its filter; streams of others do not."""
     o, rng = observation(), np.random.default_rng(5)
     noise = drifts(o, rng) + SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
-    steps = [zonda.HighpassFilter(frequency="0.5 Hz"), MaximumLikelihoodMap(pixel="15 arcsec")]
+    powers = np.fft.rfft(noise)
+    powers[:, : int(0.5 * o.duration)] = 0
     with pytest.raises(PipelineError, match="filter") as caught:
-        run(steps, o, noise)
+        mapped(o, np.fft.irfft(powers, o.n_samples))
     assert "MaximumLikelihoodMap" in str(caught.value)
-
-
-def test_a_window_is_refused():
-    o, rng = observation(), np.random.default_rng(6)
-    noise = SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
-    with pytest.raises(PipelineError, match="Taper"):
-        run([zonda.Taper(), MaximumLikelihoodMap(pixel="15 arcsec")], o, noise)
 
 
 def test_streams_without_noise_are_refused():
