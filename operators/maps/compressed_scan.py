@@ -38,6 +38,8 @@ class CompressedScan:
     ----------
     length, rate
         Samples of a baseline, and the sample rate [Hz].
+    n_pixels
+        Of the map; also the number of the pixel of samples that do not count.
     pixel, samples
         (n_runs,) int32 and uint16: pixel of each run, and its samples; one detector after the
         other, in order of time.
@@ -52,6 +54,7 @@ class CompressedScan:
     length: int
     rate: float
     n_samples: int
+    n_pixels: int
     pixel: NDArray[np.int32]
     samples: NDArray[np.uint16]
     first: NDArray[np.int64]
@@ -83,10 +86,10 @@ class CompressedScan:
         np.cumsum(s, axis=1, out=running[:, 1:])
         _spread(*self._runs, a, np.ascontiguousarray(y), running, out)
 
-    def about_means(self, s: Floats, y: Floats, a: Floats, nowhere: int) -> Floats:
+    def about_means(self, s: Floats, y: Floats, a: Floats) -> Floats:
         """Equation (2) from s' = sum_d a_kd d_d(t) (k, n_samp) of the samples that count."""
         steps = np.zeros((len(a), self.n_samples + 1))
-        _lower(self.first, self.pixel, self.samples, self.counted, nowhere, a, y, steps)
+        _lower(self.first, self.pixel, self.samples, self.counted, self.n_pixels, a, y, steps)
         return np.asarray(s + np.cumsum(steps, axis=1)[:, :-1])
 
     def weigh(self, weight: Floats, out: Floats) -> None:
@@ -127,7 +130,7 @@ class RunsOfTiles:
         self.squares[rows, here] += tile.squares
         self._tiles.append((rows, tile))
 
-    def scan(self, rate: float) -> CompressedScan:
+    def scan(self, rate: float, n_pixels: int) -> CompressedScan:
         """Runs of all tiles, detector by detector; the tiles are used up."""
         first = np.zeros(self.number.size + 1, np.int64)
         np.cumsum(self.number.ravel(), out=first[1:])
@@ -149,6 +152,7 @@ class RunsOfTiles:
             self.length,
             rate,
             self.n_samples,
+            n_pixels,
             pixel,
             samples,
             first,

@@ -107,11 +107,17 @@ class LikelihoodMaps(MapFromSums):
         half: int | None = None,
     ) -> Solution:
         """The solution for a signal, of all scans or of half of them."""
+        right = self.right_side(equations, stream, half)
+        return equations.solve(right, self.parameters.tolerance, MOST_ITERATIONS)
+
+    def right_side(
+        self, equations: NormalEquations, stream: str, half: int | None = None
+    ) -> Floats:
+        """P^T Q d of a signal (n_stokes, n_pixels), of all scans or of half of them."""
         binned = self.sums.in_pixels(stream, slice(None), half).data.T / VALUE
         scans = self.scans.scans if half is None else self.scans.scans[half::2]
         data = [one.data[stream] for one in scans]
-        right = equations.right_side(binned / self.layout["variance"], data)
-        return equations.solve(right, self.parameters.tolerance, MOST_ITERATIONS)
+        return equations.right_side(binned / self.layout["variance"], data)
 
     def _half(self, stream: str, half: int, product: MapProduct) -> tuple[Floats, NormalEquations]:
         """The map of the even or odd scans, and their equations."""

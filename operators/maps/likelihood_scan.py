@@ -163,7 +163,7 @@ class LikelihoodScan:
             polarized=first.angles is not None,
         )
         self.prepared = replace(self.prepared, halves=made)
-        scan: CompressedScan = self.found.scan(observation.sample_rate)
+        scan: CompressedScan = self.found.scan(observation.sample_rate, self.nowhere)
         self.found = scan
         for name in sorted({*observation.signals} - observation.unfiltered):
             self.baselines[name] = np.zeros(scan.shape, np.int64)
@@ -206,5 +206,5 @@ class LikelihoodScan:
         for name, sums in self.baselines.items():
             y = sums / VALUE / np.maximum(scan.counted, 1)
             s = self.common[name] / (VALUE * self.scale)
-            data[name] = (y, scan.about_means(s, y, a, self.nowhere))
+            data[name] = (y, scan.about_means(s, y, a))
         return Compressed(scan, self.noise, data)

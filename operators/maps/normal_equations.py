@@ -132,7 +132,7 @@ class NormalEquations:
         self.weights = np.zeros((1 if self.n_stokes == 1 else 6, self.n_pixels))
         for scan, noise in self.scans:
             scan.weigh(1 / noise.white, self.weights)
-        self._inverse = self._inverse_weights()
+        self._inverse = inverse_of(self.weights)
 
     @property
     def spread(self) -> Floats:
@@ -189,19 +189,21 @@ class NormalEquations:
             total += part
         return total
 
-    def _inverse_weights(self) -> Floats:
-        """Pseudo-inverse of the weights, in their places; 0 without samples."""
-        out = np.zeros_like(self.weights)
-        seen = self.weights[0] > 0
-        if self.n_stokes == 1:
-            out[:, seen] = 1 / self.weights[:, seen]
-            return out
-        low, axes = np.linalg.eigh(self.weights[:, seen].T[:, PLACES].reshape(-1, 3, 3))
-        fine = low > SINGULAR * low[:, 2:]
-        inverse = np.where(fine, 1 / np.where(fine, low, 1.0), 0.0)
-        every = np.einsum("nij,nj,nkj->nik", axes, inverse, axes)
-        out[:, seen] = every[:, *TRIANGLE].T
+
+def inverse_of(weights: Floats) -> Floats:
+    """Pseudo-inverse of symmetric matrices of pixels (1 or 6, n_pixels), in their places; 0 without
+    samples.
+    """
+    out, seen = np.zeros_like(weights), weights[0] > 0
+    if len(weights) == 1:
+        out[:, seen] = 1 / weights[:, seen]
         return out
+    low, axes = np.linalg.eigh(weights[:, seen].T[:, PLACES].reshape(-1, 3, 3))
+    fine = low > SINGULAR * low[:, 2:]
+    inverse = np.where(fine, 1 / np.where(fine, low, 1.0), 0.0)
+    every = np.einsum("nij,nj,nkj->nik", axes, inverse, axes)
+    out[:, seen] = every[:, *TRIANGLE].T
+    return out
 
 
 def times(matrix: Floats, m: Floats) -> Floats:

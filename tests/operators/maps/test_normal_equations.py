@@ -34,7 +34,7 @@ def compressed(signal, pixel, angles=None, cuts=(50, 96), single=False):
             signal[:, part], pixel[:, part], a, LENGTH, N_PIX, c[:, part], s[:, part], single
         )
         found.add(np.arange(N_DET), tile)
-    return found, found.scan(RATE)
+    return found, found.scan(RATE, N_PIX)
 
 
 def matrix(pixel, angles=None):
@@ -158,7 +158,7 @@ def test_the_map_is_that_of_generalized_least_squares(free):
     )
     y = data.reshape(N_DET, n_base, LENGTH).mean(axis=2)
     a = noise.free_modes
-    s = scan.about_means(np.einsum("kd,dt->kt", a, data.reshape(N_DET, N)), y, a, N_PIX)
+    s = scan.about_means(np.einsum("kd,dt->kt", a, data.reshape(N_DET, N)), y, a)
     binned = (p.T @ (data / sigma**2))[None]
     found = system.solve(system.right_side(binned, [(y, s)]), 1e-12, 500)
     best = np.linalg.lstsq(left[np.ix_(seen, seen)], right[seen], rcond=1e-12)[0]
@@ -180,7 +180,7 @@ def test_a_noiseless_sky_comes_back(flagged):
     noise = BaselineNoise(**{**vars(noise), "lines": polynomials(scan.shape[1], 1)})
     system = NormalEquations([WeighedScan(scan, noise)], 1, N_PIX)
     a, counted = noise.free_modes, np.where(pixel >= 0, data, 0.0)
-    s = scan.about_means(np.einsum("kd,dt->kt", a, counted), found.means, a, N_PIX)
+    s = scan.about_means(np.einsum("kd,dt->kt", a, counted), found.means, a)
     right = system.right_side((p.T @ counted.ravel())[None], [(found.means, s)])
     m = system.solve(right, 1e-13, 1000).values[0]
     seen = system.weights[0] > 0
