@@ -22,6 +22,7 @@ from zonda.core.configuration.pipeline_file import parse
 from zonda.core.errors import InputError, PipelineError, ZondaError
 from zonda.core.flags import INVALID, SUN_UP, TURNAROUND
 from zonda.core.testing import Given, Points, made_up_scene
+from zonda.operators.io.recorded_stream import kelvin_per
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.plugins.checks.scenes import sky_file
 
@@ -781,3 +782,20 @@ def test_a_stream_that_is_no_temperature_is_refused(saved: Any, tmp_path: Path) 
     with h5py.File(path, "a") as file:
         file["shared/flags"][777] = 1
     assert np.isfinite(load(path, MAP)["map"].signal).any()
+
+
+@pytest.mark.parametrize(
+    ("unit", "kelvin"),
+    [
+        ("K", 1.0),
+        ("mK", 1e-3),
+        (" K_CMB ", 1.0),
+        ("mK_CMB", 1e-3),
+        ("uK_RJ", 1e-6),
+        ("mJy", None),
+        ("pW", None),
+        ("", None),
+    ],
+)
+def test_prefixes_of_kelvin_count_on_either_scale(unit: str, kelvin: float | None) -> None:
+    assert kelvin_per(unit) == (None if kelvin is None else pytest.approx(kelvin, rel=1e-12))
