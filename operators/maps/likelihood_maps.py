@@ -51,9 +51,8 @@ class LikelihoodMaps(MapFromSums):
             values = np.zeros((len(rows), self.grid.n_pixels))
             values[:, self._seen] = rows.reshape(len(rows), -1)
             signal = self._determined(values, equations, product)
-            return replace(
-                product.with_planes(signal=self._rows(product, signal)), taken_off=self._taken
-            )
+            made = product.with_planes(signal=self._rows(product, signal))
+            return replace(made, noise_from="streams", taken_off=self._taken)
         solution = self._solved(equations, stream)
         planes = {
             "signal": self._rows(product, self._determined(solution.values, equations, product))
@@ -76,7 +75,7 @@ class LikelihoodMaps(MapFromSums):
         """Normal equations of all scans, with the noise of data minus the map."""
         found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
         step = self.parameters
-        for _ in range(step.refine):
+        for _ in range(step.refine if step.noise != "simulated" else 0):
             m = self._solved(found, self.sums.first).values
             scans = []
             for one, (scan, noise) in zip(self.scans.scans, found.scans, strict=True):
@@ -92,6 +91,8 @@ class LikelihoodMaps(MapFromSums):
                     trend=step.trend,
                     fixed=noise.modes[: noise.free],
                 )
+                if step.noise != "estimated":
+                    new = replace(new, own=noise.own)  # that of a table
                 scans.append(WeighedScan(scan, new))
             found = self._of(scans)
         return found
