@@ -16,6 +16,7 @@ import argparse
 import os
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -233,8 +234,41 @@ LAT = {
 }
 
 
+ITERATIONS = (15, 30, 60, 120)
+
+
+def waves(shape: tuple[int, int], seed: int) -> Any:
+    """I, Q and U of a random field with a power of 1 / k^2, Q and U a tenth of I."""
+    k = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n) for n in shape), indexing="ij"))
+    white = np.random.default_rng(seed).normal(size=(3, *shape))
+    field = np.fft.ifft2(np.fft.fft2(white) / np.where(k > 0, k, np.inf)).real
+    field *= np.array([1.0, 0.1, 0.1])[:, None, None] / field.std(axis=(1, 2), keepdims=True)
+    return field.reshape(3, -1)
+
+
+def convergence(equations: Any, shape: tuple[int, int], ok: Any, seed: int) -> None:
+    """Error of I of a map without noise, its mean off, over the rms of the sky, by iteration, with
+    and without smooth patterns in the preconditioner.
+    """
+    sky = waves(shape, seed) * ok.ravel()
+    right = equations.apply(sky)
+    print("error of I without noise after " + ", ".join(map(str, ITERATIONS)) + " iterations, %")
+    for name, places in (("pixels", None), ("smooth patterns", equations.places)):
+        system, row = replace(equations, places=places), []
+        for most in ITERATIONS:
+            error = (system.solve(right, 1e-4, most).values - sky)[0, ok.ravel()]
+            row.append(100 * error.std() / sky[0, ok.ravel()].std())
+        start = time.process_time()
+        found = system.solve(right, 1e-4, 1000)
+        seconds = time.process_time() - start
+        print(
+            f"{name:19s}", ", ".join(f"{e:.3g}" for e in row),
+            f" to 1e-4: {len(found.history)} iterations, {seconds:.1f} CPU s",
+        )  # fmt: skip
+
+
 def survey(seed: int) -> None:
-    """Noise of I, Q and U over white noise."""
+    """Noise of I, Q and U over white noise, and convergence."""
     with TemporaryDirectory() as folder:
         file = Path(folder) / "night.ecsv"
         file.write_text(SCHEDULE)
@@ -256,7 +290,7 @@ def survey(seed: int) -> None:
         seconds = time.process_time() - start
         filters = [zonda.PolynomialFilter(order=1)]
         binned = run(scene, [*steps, *filters, zonda.BinMap(**how)], signals={})["map"]
-    _, solution, cpu = KEPT[0]["signal"]
+    equations, solution, cpu = KEPT[0]["signal"]
     samples = int(found.hits.sum())
     print(
         f"{samples:.3g} samples, {len(solution.history)} iterations,"
@@ -272,6 +306,7 @@ def survey(seed: int) -> None:
             m = one.signal - np.nanmean(one.signal[ok])
             ratio.append(np.nanstd((m / found.stokes(k).noise)[ok]))
         print(f"{name:19s} noise over white: " + ", ".join(f"{r:.2f}" for r in ratio))
+    convergence(equations, found.hits.shape, ok, seed)
 
 
 def main() -> None:

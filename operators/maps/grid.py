@@ -106,6 +106,10 @@ class ImageGrid(PixelGrid):
         """Places of the pixels that a map of ``hits`` (n_pixels,) has: all."""
         return slice(None)
 
+    def places(self, pixels: NDArray[np.intp]) -> Floats:
+        """(2, n) rows and columns of pixels."""
+        return np.array(np.divmod(pixels, self.shape[1]), np.float64)
+
     def described(self, seen: Any) -> dict[str, Any]:
         """Header, pixel size and places, as `Map` takes them."""
         return {"header": self.header, "pixel": self.pixel}
@@ -201,6 +205,18 @@ class HealpixGrid(PixelGrid):
     def seen(self, hits: Any) -> Any:
         """Places of the pixels that a map of ``hits`` (n_pixels,) has: those with some."""
         return np.flatnonzero(hits)
+
+    def places(self, pixels: NDArray[np.intp]) -> Floats:
+        """(2, n) latitude and longitude [rad] of pixels about a great circle through their middle,
+        along which most of them lie.
+        """
+        import healpy
+
+        at = np.array(healpy.pix2vec(self.nside, self.pixels_covered[pixels], nest=self.nest))
+        axes = np.linalg.eigh(np.einsum("ip,jp->ij", at, at))[1]
+        across, along, ahead = np.einsum("ji,jp->ip", axes, at)
+        ahead *= 1.0 if ahead.sum() >= 0 else -1.0
+        return np.array([np.arcsin(np.clip(across, -1, 1)), np.arctan2(along, ahead)])
 
     def described(self, seen: Any) -> dict[str, Any]:
         """Header, pixel size and places, as `Map` takes them."""

@@ -51,8 +51,9 @@ class LikelihoodMaps(MapFromSums):
             values = np.zeros((len(rows), self.grid.n_pixels))
             values[:, self._seen] = rows.reshape(len(rows), -1)
             signal = self._determined(values, equations, product)
-            made = product.with_planes(signal=self._rows(product, signal))
-            return replace(made, noise_from="streams", taken_off=self._taken)
+            return replace(
+                product.with_planes(signal=self._rows(product, signal)), taken_off=self._taken
+            )
         solution = self._solved(equations, stream)
         planes = {
             "signal": self._rows(product, self._determined(solution.values, equations, product))
@@ -75,7 +76,7 @@ class LikelihoodMaps(MapFromSums):
         """Normal equations of all scans, with the noise of data minus the map."""
         found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
         step = self.parameters
-        for _ in range(step.refine if step.noise != "simulated" else 0):
+        for _ in range(step.refine):
             m = self._solved(found, self.sums.first).values
             scans = []
             for one, (scan, noise) in zip(self.scans.scans, found.scans, strict=True):
@@ -91,15 +92,15 @@ class LikelihoodMaps(MapFromSums):
                     trend=step.trend,
                     fixed=noise.modes[: noise.free],
                 )
-                if step.noise != "estimated":
-                    new = replace(new, own=noise.own)  # that of a table
                 scans.append(WeighedScan(scan, new))
             found = self._of(scans)
         return found
 
     def _of(self, scans: Sequence[WeighedScan]) -> NormalEquations:
         n_stokes = 3 if self.sums.polarized else 1
-        return NormalEquations(scans, n_stokes, self.grid.n_pixels, self.data.threads)
+        return NormalEquations(
+            scans, n_stokes, self.grid.n_pixels, self.data.threads, self.grid.places
+        )
 
     def _solved(
         self,
@@ -172,6 +173,9 @@ class LikelihoodMaps(MapFromSums):
             least = min(solution.history)
             log.state(label, "residual over right side", f"{least:.1e}")
             log.state(label, "smallest Ritz value", f"{solution.ritz[0]:.1e}")
+            if solution.smooth:
+                found = f"{len(solution.smooth.rows)}, after {solution.before} iterations"
+                log.state(label, "smooth patterns of the preconditioner", found)
             if least >= step.tolerance:
                 warnings.warn(
                     f"{label}: after {len(solution.history)} iterations the residual is"

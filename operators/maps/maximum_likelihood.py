@@ -12,9 +12,7 @@ After the first solution the noise is estimated anew from baselines minus those 
 
 from __future__ import annotations
 
-from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +21,7 @@ from pydantic import PrivateAttr
 from zonda.core.data import Block, Data, Observation, Stream
 from zonda.core.errors import PipelineError
 
+from .baseline_noise import estimate
 from .bin_map import BinMap
 from .binning import Weights
 from .likelihood_maps import LikelihoodMaps
@@ -33,9 +32,6 @@ from .map_sums import MapSums
 from .normal_equations import (
     CompressedScans,
 )
-
-if TYPE_CHECKING:
-    from zonda.core.detector_files import NoiseTable
 
 LEAST_POWER, FREEDOM = 0.2, 40
 """Of slow baselines, in units of white noise: less is left where a filter has removed slow noise.
@@ -76,19 +72,9 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         found = super().check(data)
         for observation in data.observations:
             self._length(observation)
-            if self._table is not None:
-                names = np.array(observation.focalplane.names)[observation.good_detectors]
-                self._table.of(names.tolist(), f"{self.label}, {observation.name}")
         if self.width is not None and data.observations:
             self._need_all(MapLayout(self).outside(data.observations), self.label)
         return found
-
-    @cached_property
-    def _table(self) -> NoiseTable | None:
-        """The table of ``noise``."""
-        from zonda.core.detector_files import read_noise  # it imports h5py
-
-        return read_noise(self.noise) if isinstance(self.noise, Path) else None
 
     def _length(self, observation: Observation) -> int:
         """Samples of a baseline. Raises PipelineError for too few or too short baselines."""
@@ -144,7 +130,16 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         scan.compress(stream, self.label)
         observation, white = stream.observation, scan.white(self.label)
         for _ in range(WHITE_LEVELS):
-            scan.noise = scan.estimate(white, self)
+            scan.noise = estimate(
+                scan.found.means,
+                scan.found.counted,
+                white,
+                scan.length,
+                observation.sample_rate,
+                modes=self.modes,
+                free=self.free,
+                trend=self.trend,
+            )
             white = np.where(scan.noise.fast < STEADY, white * scan.noise.fast, white)
             if (white == scan.noise.white).all():
                 break
@@ -158,8 +153,6 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
                 place=f"{self.label}, {observation.name}",
                 cure=f"put {type(self).__name__} before filters, or leave these out",
             )
-        if self.noise != "estimated":
-            scan.state_noise(self, self._table)
         scan.give_weights(self._layout["variance"], self._spare)
         return scan
 

@@ -12,15 +12,21 @@ Conjugate gradients, preconditioned with the inverse of the weights in each pixe
 pseudo-inverse of a 3 x 3 matrix), end where the norm of the residual in that metric is `tolerance`
 times that of the right side. Of their coefficients follow the Ritz values of the preconditioned
 matrix: where the smallest is far below 1 there are patterns that the data hardly determine.
+
+After `PATIENCE` iterations, where those that are left cost more than `preconditioner` does, they
+begin again at the map of least residual that they have, with smooth patterns added to the
+preconditioner. Residuals alone decide, not seconds: the map's bits depend on nothing else.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.product import Product
 from zonda.core.stream import in_order
@@ -29,11 +35,11 @@ from zonda.core.types import Floats
 from .baseline_noise import BaselineNoise
 from .compressed_scan import CompressedScan
 from .map_from_sums import SINGULAR, TRIANGLE
+from .preconditioner import PATTERNS, UNDETERMINED, SmoothPatterns
 from .stokes_kernel import PLACES
 
-UNDETERMINED = 1e-8
-"""A direction p with less information p^T A p, as a share of that of white noise, p^T W p with the
-weights W of pixels, holds rounding alone."""
+PATIENCE, RECENT = 25, 10
+"""Iterations before smooth patterns are thought of; those that tell how many are left."""
 
 
 @dataclass
@@ -106,27 +112,35 @@ class Solution(NamedTuple):
     values
         (n_stokes, n_pixels), K; 0 without samples. The one with the least residual.
     history
-        Norm of the residual after each iteration, over that of the right side.
+        Norm of the residual after each iteration, over that of the right side, in the metric of the
+        preconditioner in use.
     ritz
-        Ritz values of the preconditioned matrix, rising.
+        Ritz values of the matrix preconditioned with the weights of pixels, rising: those of the
+        iterations without smooth patterns, and those of the patterns.
+    smooth, before
+        Smooth patterns of the preconditioner, and the iterations before they were added.
     """
 
     values: Floats
     history: list[float]
     ritz: Floats
+    smooth: SmoothPatterns | None = None
+    before: int = 0
 
 
 @dataclass
 class NormalEquations:
     """Equation (1) of some scans, for maps (n_stokes, n_pixels).
 
-    ``threads``: scans that are worked on at a time.
+    ``threads``: scans that are worked on at a time; ``places``: coordinates (2, n) of pixels, for
+    smooth patterns.
     """
 
     scans: Sequence[WeighedScan]
     n_stokes: int
     n_pixels: int
     threads: int = 1
+    places: Callable[[NDArray[np.intp]], Floats] | None = None
 
     def __post_init__(self) -> None:
         self.weights = np.zeros((1 if self.n_stokes == 1 else 6, self.n_pixels))
@@ -151,12 +165,19 @@ class NormalEquations:
         """Conjugate gradients from 0, at most so many iterations: the map with the least residual.
         Behind it, and along patterns that the data do not determine, there is rounding alone.
         """
-        m, r = np.zeros_like(right), right.copy()
+        m, r, smooth, before = np.zeros_like(right), right.copy(), None, 0
         z = times(self._inverse, r)
         p, product = z.copy(), float((r * z).sum())
-        first, history = product, list[float]()
+        first, history, ritz = product, list[float](), list[Floats]()
         steps, turns, best, size = list[float](), list[float](), m, product
         while first > 0 and len(history) < most and (not history or history[-1] >= tolerance):
+            if smooth is None and self.places and takes_long(history, tolerance):
+                smooth, before = self.smooth, len(history)
+                ritz = [ritz_values(steps, turns), smooth.information]
+                z[0] += smooth.correct(r[0])
+                p, product, steps, turns = z, float((r * z).sum()), [], []
+                size = product
+                first += float((right[0] * smooth.correct(right[0])).sum())
             q = self.apply(p)
             if (curvature := float((p * q).sum())) <= UNDETERMINED * size:
                 break
@@ -164,14 +185,29 @@ class NormalEquations:
             m += step * p
             r -= step * q
             z = times(self._inverse, r)
-            product, before = float((r * z).sum()), product
+            if smooth:
+                z[0] += smooth.correct(r[0])
+            product, last = float((r * z).sum()), product
             steps.append(step)
-            turns.append(product / before)
+            turns.append(product / last)
             history.append(float(np.sqrt(max(product, 0.0) / first)))
-            if history[-1] == min(history):
+            if history[-1] == min(history[before:]):
                 best = m.copy()
             p, size = z + turns[-1] * p, product + turns[-1] ** 2 * size
-        return Solution(best, history, ritz_values(steps, turns))
+        ritz = ritz or [ritz_values(steps, turns)]
+        return Solution(best, history, np.sort(np.concatenate(ritz)), smooth, before)
+
+    @cached_property
+    def smooth(self) -> SmoothPatterns:
+        """Smooth patterns of I, and what the scans tell of them."""
+        assert self.places is not None
+
+        def of_intensity(m: Floats) -> Floats:
+            rows = np.zeros((self.n_stokes, self.n_pixels))
+            rows[0] = m
+            return np.asarray(self.apply(rows)[0])
+
+        return SmoothPatterns.of(self.places, self.weights[0], of_intensity)
 
     def _added(self, of: Sequence[Floats | tuple[Floats, Floats]]) -> Floats:
         """Last three terms of equation (1), added up in order: of a map, or of y and s of the data
@@ -211,6 +247,14 @@ def times(matrix: Floats, m: Floats) -> Floats:
     if len(matrix) == 1:
         return matrix * m
     return np.stack([(matrix[list(row)] * m).sum(axis=0) for row in np.reshape(PLACES, (3, 3))])
+
+
+def takes_long(history: Sequence[float], tolerance: float) -> bool:
+    """True where the last iterations say that there are more left than `PATTERNS`."""
+    if len(history) < PATIENCE:
+        return False
+    gained = np.log(history[-1 - RECENT] / history[-1])
+    return bool(RECENT * np.log(history[-1] / tolerance) > PATTERNS * gained)
 
 
 def ritz_values(steps: Sequence[float], turns: Sequence[float]) -> Floats:

@@ -106,12 +106,13 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         return super().memory(observation) + int(runs + sums) + COMPILED
 
     def finished(self, observation: Observation) -> tuple[int, int]:
-        """Maps of conjugate gradients, and weights with their inverse; of a half difference those
-        of the whole and of one half, too.
+        """Maps of conjugate gradients and of smooth patterns, and weights with their inverse; of a
+        half difference those of the whole and of one half, too.
         """
         most, product = super().finished(observation)
         stokes, weights = (3, 12) if self.polarized else (1, 2)
-        maps = 15 * stokes + weights + 2 * (stokes + weights) * bool(self.operator.half_difference)
+        halves = 2 * (stokes + weights) * bool(self.operator.half_difference)
+        maps = 15 * stokes + weights + 6 + halves
         return most + 8 * maps * self.pixels, product + COMPILED
 
     @property
