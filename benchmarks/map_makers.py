@@ -25,10 +25,14 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np  # noqa: E402
+from pydantic import PrivateAttr  # noqa: E402
 from scipy import ndimage  # noqa: E402
 
 import zonda  # noqa: E402
+from zonda.core.data import Data  # noqa: E402
+from zonda.core.maps.noise_figures import matched  # noqa: E402
 from zonda.operators.maps import maximum_likelihood as ml  # noqa: E402
+from zonda.operators.maps.grid import Looking  # noqa: E402
 
 RESPONSE = "AtmosphereLayers.layer_response=layer"
 PIPELINES = {
@@ -166,29 +170,86 @@ def compare(kind: str, seed: int) -> None:
     )
 
 
-def templates(seeds: int) -> None:
-    """Signal-to-noise ratio of the true cluster, and deviates of noise in its units, at four places
-    for each seed: sqrt(t^T A t), and t^T b / sqrt(t^T A t)."""
+PLACES = ((0, 0), (30, 30), (-30, 30), (30, -30))
+"""Of the cluster in rows and columns: each is a draw of the noise."""
+SMALL = 1e-3
+"""Of templates in the streams: they change neither modes nor the noise model."""
+
+
+class Template(zonda.Operator):
+    """A map at one of the `PLACES` as a component."""
+
+    requires = frozenset({"boresight"})
+
+    place: int = 0
+    """Its number."""
+    _map: Any = PrivateAttr(None)
+    _maker: Any = PrivateAttr(None)
+
+    @property
+    def provides(self) -> frozenset[str]:
+        return frozenset({zonda.Component(f"t{self.place}", "calibrated")})
+
+    def observe(self, data: Any) -> None:
+        self._maker.observe(Data(data.scene, data.observations))
+
+    def exec(self, block: Any, state: Any) -> None:
+        looking = Looking.of(block.observation, self._maker.grid)
+        rows = np.arange(block.detectors.start, block.detectors.stop)
+        pixel = looking.pixels(rows, block.samples.start, block.samples.stop)
+        block.new(f"t{self.place}")[...] = np.where(pixel < 0, 0.0, self._map[pixel])
+
+
+def templates(seeds: list[int]) -> None:
+    """Signal-to-noise ratio of the true cluster over draws of the noise, at four places for each
+    seed, and deviates of the noise in its units.
+
+    Maximum likelihood: sqrt(t^T A t), and t^T A n / sqrt(t^T A t) of the map n of the noise. Filter
+    and bin, of which no A is known: a = t^T h m / t^T h f of a map m, with the hits h and the
+    filtered template f, whose scatter over the draws of m = n is the error.
+    """
+    scene, steps, how, filters = pipeline("m2", 1)
+    quiet = [s for s in steps if not {"white", "pink", "atmosphere"} & set(s.provides)]
+    truth = run(scene, [*quiet, zonda.BinMap(**how)], signals={})["map"]
+    t = np.nan_to_num(truth.signal)
+    sources = []
+    for k, place in enumerate(PLACES):
+        sources.append(Template(place=k, name=f"template{k}"))
+        sources[-1]._map = SMALL * np.roll(t, place, (0, 1)).ravel()
+        sources[-1]._maker = zonda.BinMap(**how)
+    names = [f"t{k}" for k in range(len(PLACES))]
+    signals = {name: {"only": [name]} for name in names} | {"rest": {"without": ["sky", *names]}}
     rows = []
-    for seed in range(1, seeds + 1):
-        scene, steps, how, _ = pipeline("m2", seed)
-        truth = run(scene, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})[
-            "sky/map"
-        ]
-        run(scene, [*steps, Maker(**how)])
-        maps = KEPT[0]
-        equations = maps["signal"][0]
-        noise = maps["signal/rest"][1].values
-        for dy, dx in ((0, 0), (30, 30), (-30, 30), (30, -30)):
-            t = np.roll(np.nan_to_num(truth.signal), (dy, dx), (0, 1))
-            t = t.ravel()[None] * (equations.weights[0] > 0)
-            product = equations.apply(t)
-            size = np.sqrt(float((t * product).sum()))
-            rows.append((size, float((product * noise).sum()) / size))
+    for seed in seeds:
+        scene = scene.model_copy(update={"seed": seed})
+        made = run(
+            scene,
+            [
+                *steps[:-1],
+                *sources,
+                steps[-1],
+                zonda.MaximumLikelihoodMap(**how, product="likely"),
+                *filters,
+                zonda.BinMap(**how, product="binned"),
+            ],
+            full=True,
+            signals=signals,
+        )
+        noise = made["rest/binned"].signal
+        for name, source in zip(names, sources, strict=True):
+            z, size = matched(made[f"{name}/likely"], made["rest/likely"])
+            w = truth.hits * source._map.reshape(noise.shape) / SMALL
+            filtered = float(np.nansum(w * made[f"{name}/binned"].signal)) / SMALL
+            rows.append((1 / size / SMALL, z / size, filtered, float(np.nansum(w * noise))))
+        print(seed, *(" ".join(f"{x:.4g}" for x in row) for row in rows[-len(PLACES) :]), sep="; ")
     found = np.array(rows)
+    likely, binned = found[:, 0].mean(), found[:, 2].mean() / np.sqrt((found[:, 3] ** 2).mean())
+    n = len(found)
     print(
-        f"template: S/N {found[:, 0].mean():.2f}, rms of {len(found)} deviates"
-        f" {np.sqrt((found[:, 1] ** 2).mean()):.3f} +- {1 / np.sqrt(2 * len(found)):.3f}"
+        f"template, {n} draws: S/N {likely:.2f} of maximum likelihood, rms of deviates"
+        f" {np.sqrt((found[:, 1] ** 2).mean()):.3f} +- {1 / np.sqrt(2 * n):.3f};"
+        f" {binned:.2f} +- {binned / np.sqrt(2 * n):.2f} of filter and bin;"
+        f" ratio {likely / binned:.2f}"
     )
 
 
@@ -318,7 +379,7 @@ def main() -> None:
     parser.add_argument("--templates", type=int, default=0, metavar="SEEDS")
     options = parser.parse_args()
     if options.templates:
-        templates(options.templates)
+        templates([options.seed + k for k in range(options.templates)])
     elif options.kind == "survey":
         survey(options.seed)
     else:

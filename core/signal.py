@@ -86,6 +86,11 @@ class Signal(Parameters):
         """True if surely no noise of detectors is in it."""
         return self.only is not None and set(self.only) <= {"sky", "atmosphere", TRANSMISSION}
 
+    @property
+    def is_source(self) -> bool:
+        """True if it keeps neither the atmosphere nor zonda's noise."""
+        return self.only is not None and not {"atmosphere", "white", "pink"} & set(self.only)
+
 
 @dataclass(frozen=True)
 class Formed:

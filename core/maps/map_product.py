@@ -14,7 +14,7 @@ from ..numerics.sphere import FWHM_PER_SIGMA, angle_text, sides_text
 from ..tables import html_table
 from ..types import Floats
 from .map_arrays import MapArrays
-from .planes import central_diameter
+from .planes import Plane, central_diameter
 from .smoothing import CUT, error_of_mean, smoother, weighted_mean
 
 if TYPE_CHECKING:
@@ -193,7 +193,7 @@ class MapProduct(MapArrays):
         if self.polarization is not None:
             return self._with_parts([one.smoothed(fwhm) for one in self.by_stokes().values()])
         convolve = smoother(self.grid, fwhm)
-        known, planes = self.known, dict(self.planes)
+        known, planes = self.known, self._smoothable
         total: Any = None
         weights = np.where(known, self.weights, 0.0)
         for name, plane in planes.items():  # the signal is the first
@@ -219,10 +219,14 @@ class MapProduct(MapArrays):
             name: plane
             if plane.stokes is None
             else replace(plane, values=np.stack([part.planes[name].values[0] for part in parts]))
-            for name, plane in self.planes.items()
+            for name, plane in self._smoothable.items()
         }
         made = replace(self, planes=planes, smoothed_by=parts[0].smoothed_by)
         return made.with_planes(covariance=covariance)
+
+    @property
+    def _smoothable(self) -> dict[str, Plane]:
+        return {name: plane for name, plane in self.planes.items() if plane.smoothing != "lost"}
 
     @property
     def healpix_full(self) -> Floats:

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..errors import InputError
 from ..signal import Signal
 from ..types import Floats
 from .map_product import MapProduct
@@ -69,6 +70,36 @@ def noise_figures(maps: Mapping[str, MapProduct], given: float | None = None) ->
             )
             found.append(NoiseFigure(name, of, rms, smoothed, diameter))
     return found
+
+
+def matched(template: MapProduct, product: MapProduct) -> tuple[float, float]:
+    """Amplitude of a template t in a map m of the same scans, and its standard error,
+
+        a = (A t)^T m / t^T A t,   sigma = (t^T A t)^(-1/2).                                    (1)
+
+    ``template``: maximum-likelihood map of a signal without noise, which has A t as a plane. 1 /
+    sigma is its signal-to-noise ratio as a template. Raises InputError for one without, or without
+    power, and for maps of other samples or in another unit.
+    """
+    if "template" not in template.planes:
+        raise InputError(
+            "the map has no weights as a template",
+            place="template",
+            cure="take the maximum-likelihood map of a signal without noise, e.g. {only: [sky]},"
+            " not smoothed",
+        )
+    if not np.array_equal(template.hits, product.hits) or template.unit != product.unit:
+        raise InputError(
+            "the map has other samples or another unit than the template",
+            place="template",
+            cure="take both maps from one run, with the same pixels, and in one unit",
+        )
+    weights = np.nan_to_num(template.planes["template"].values)
+    t, m = (np.nan_to_num(one.planes["signal"].values) for one in (template, product))
+    power = float((weights * t).sum())
+    if not power > 0:
+        raise InputError("the template is empty", place="template", cure="use a sky with a source")
+    return float((weights * m).sum()) / power, power**-0.5
 
 
 FREE = "the map of all but the sky"

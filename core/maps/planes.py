@@ -154,7 +154,7 @@ class Plane:
         The plane belongs to I, Q and U together, and goes where one of them is taken.
     smoothing
         Smoothed maps hold the weighted ``mean``, or the standard ``error`` of it; or the plane is
-        ``kept``.
+        ``kept``, or ``lost``.
     noise_of
         Stokes parameter whose noise a row holds, by the row's name: its header says what the noise
         was measured in.
@@ -173,7 +173,7 @@ class Plane:
     unit: str = ""
     stokes: Mapping[str, str] | None = None
     joint: bool = False
-    smoothing: Literal["mean", "error", "kept"] = "kept"
+    smoothing: Literal["mean", "error", "kept", "lost"] = "kept"
     noise_of: Mapping[str, str] = field(default_factory=dict)
     of_halves: bool = False
     colours: tuple[float | None, float | None] | None = None
@@ -205,6 +205,7 @@ class Plane:
 
 
 NOTHING = np.zeros((0, 0))
+TEMPLATE = "weights of this map as a template"
 KNOWN = {
     "signal": Plane(
         NOTHING,
@@ -253,8 +254,17 @@ KNOWN = {
         smoothing="mean",
         of_halves=True,
     ),
+    "template": Plane(
+        NOTHING,
+        {"template_weights": TEMPLATE},
+        -1,
+        stokes={f"template_weights{row}": TEMPLATE for row in ("", "_q", "_u")},
+        joint=True,
+        smoothing="lost",
+    ),
 }
-"""Planes of every map, of polarized ones, and of maps of two halves, without values."""
+"""Planes of every map, of polarized ones, of maps of two halves, and of templates (`matched` of
+`noise_figures`), without values."""
 
 
 T = TypeVar("T")

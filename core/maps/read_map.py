@@ -28,6 +28,8 @@ ABOUT = (
     *("TELESCOP", "INSTRUME", "SITE", "OBJECT", "RESTFRQ", "BAND"),
 )
 """Cards that `MapProduct.write` writes again."""
+OF_U = frozenset({"half_difference_u", "cov_iu", "cov_qu", "template_weights_u"})
+"""Rows whose sign is that of U."""
 SAME_BAND = 1e-9
 """Relative difference of the centres of one band."""
 
@@ -222,7 +224,7 @@ class _Reader(FileHeader):
         """The planes of the rows; ``own``: the unit of I as it is written."""
         iqu = {"q", "u"} <= set(self.rows)
         if iqu and self._is_iau():
-            for name in {"u", "half_difference_u", "cov_iu", "cov_qu"} & set(self.rows):
+            for name in {"u", *OF_U} & set(self.rows):
                 self.rows[name] = -self.rows[name][0], self.rows[name][1]
         planes: dict[str, Plane] = {}
         for name, plane in KNOWN.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -15,7 +16,7 @@ from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.maps.noise_figures import Noise, is_quiet, maps_of, noise_alone
+from zonda.core.maps.noise_figures import Noise, is_quiet, maps_of, matched, noise_alone
 from zonda.core.maps.smoothing import smoother
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.sphere import beam_area
@@ -131,6 +132,10 @@ class CompareMaps(Output):
         if len(both) < max(len(maps), len(references)):
             which = "reference" if len(references) == 1 else "map"
             data.log.state(self.label, "Q and U", f"not compared: the {which} has none")
+        reference = data.products.get(self.reference)
+        if self.file is None and isinstance(reference, MapProduct):
+            for what, text in template_rows(reference, _product(data, self.map, self.label)):
+                data.log.state(self.label, what, text)
         first = plane_of(maps["I"][1], self.map)
         references = on_meridians_of(first, {plane: references[plane] for plane in both})
         runs = data.provenance.get("runs", {})
@@ -227,6 +232,19 @@ def _product(data: Data, name: str, place: str) -> Any:
     maps = ((key, p) for key, p in data.products.items() if isinstance(p, Image | MapProduct))
     cure = f"name one of these: {', '.join(key for key, _ in maps if not key.startswith('_'))}"
     raise PipelineError(f"there is no map {name!r}", place=place, cure=cure)
+
+
+def template_rows(reference: Any, other: Any) -> list[tuple[str, str]]:
+    """Signal-to-noise ratio of a reference that is a template (`matched`), and its amplitude in the
+    map if that is of the same samples; nothing of others.
+    """
+    rows = []
+    with suppress(InputError):
+        _, error = matched(reference, reference)
+        rows.append(("S/N of the reference as a template", f"{1 / error:.4g}"))
+        amplitude, error = matched(reference, other)
+        rows.append(("its amplitude in the map", f"{amplitude:.4g} +- {error:.2g}"))
+    return rows
 
 
 def _tell(label: str, of: str, data: Data, found: Comparison) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from zonda.core.data import Data
 from zonda.core.maps.map_product import MapProduct
-from zonda.core.signal import MAIN
+from zonda.core.signal import MAIN, Signal
 from zonda.core.types import Floats
 
 from .baseline_noise import estimate
@@ -45,19 +45,12 @@ class LikelihoodMaps(MapFromSums):
         it is the mean of the samples, of which the same is taken off.
         """
         product, equations = super().map_of(stream), self.equations
-        mean = stream not in self.scans.scans[0].data
-        if mean:
+        if stream not in self.scans.scans[0].data:
             rows = np.nan_to_num(product.planes["signal"].values)
             values = np.zeros((len(rows), self.grid.n_pixels))
             values[:, self._seen] = rows.reshape(len(rows), -1)
-            signal = self._determined(values, equations, product)
-            return replace(
-                product.with_planes(signal=self._rows(product, signal)), taken_off=self._taken
-            )
+            return self._with_values(product, values, stream)
         solution = self._solved(equations, stream)
-        planes = {
-            "signal": self._rows(product, self._determined(solution.values, equations, product))
-        }
         if self.halves:
             (one, first), (two, second) = (self._half(stream, k, product) for k in range(2))
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -65,11 +58,24 @@ class LikelihoodMaps(MapFromSums):
                 values = np.where(
                     (first.spread > 0) & (second.spread > 0), (one - two) * share, np.nan
                 )
-            planes["half_difference"] = self._rows(product, values)
+            product = product.with_planes(half_difference=self._rows(product, values))
         if stream == MAIN:
             self._tell(solution)
-        made = product.with_planes(**planes)
-        return replace(made, noise_from="streams", taken_off=self._taken)
+        made = self._with_values(product, solution.values, stream)
+        return replace(made, noise_from="streams")
+
+    def _with_values(self, product: MapProduct, values: Floats, stream: str) -> MapProduct:
+        """The product of a signal with these values, (n_stokes, n_pixels), and its weights as a
+        template where it is without noise.
+        """
+        rows = self._rows(product, self._determined(values, self.equations, product))
+        made = replace(product.with_planes(signal=rows), taken_off=self._taken)
+        runs, signal = self.data.provenance.get("runs", {}), stream.partition("/")[2]
+        if signal not in runs or not Signal(**runs[signal]).is_source:
+            return made
+        t = np.zeros((len(rows), self.grid.n_pixels))
+        t[:, self._seen] = np.nan_to_num(rows).reshape(len(rows), -1)
+        return made.with_planes(template=self._rows(product, self.equations.apply(t)))
 
     @cached_property
     def equations(self) -> NormalEquations:

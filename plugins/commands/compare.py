@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -230,6 +231,8 @@ def _compare(
 ) -> None:
     """One comparison, printed and written to ``folder``."""
     from zonda.core.errors import InputError
+    from zonda.core.maps.read_map import read_map
+    from zonda.operators.diagnostics.compare_maps import template_rows
     from zonda.operators.diagnostics.comparison import statistics
     from zonda.operators.diagnostics.comparison.files import (
         Wanted,
@@ -272,6 +275,9 @@ def _compare(
     maps = read[1].planes
     references = on_meridians_of(maps["I"], read[0].planes)
     both, written = [plane for plane in maps if plane in references], []
+    matched: list[tuple[str, str]] = []
+    with suppress(InputError):
+        matched = template_rows(*map(read_map, paths)) if all(one.own for one in read) else []
     hertz = frequency or read[0].frequency or read[1].frequency
     for plane in both:
         one = references[plane]
@@ -280,7 +286,8 @@ def _compare(
         one, other = _in_one_unit(one, maps[plane], unit, hertz, common)
         both_of = replace(one, fwhm=fwhm), other
         found = statistics.compare(*both_of, beam, threshold, apertures=apertures)
-        text = "\n".join(lines(found, fluxes(found, apertures, other, hertz)))
+        more = [*fluxes(found, apertures, other, hertz), *(matched if plane == "I" else ())]
+        text = "\n".join(lines(found, more))
         click.echo(f"Stokes {plane}\n{text}\n" if len(both) > 1 else text)
         name = plane_key("comparison", plane)
         written += write_comparison(found, folder / name, {})

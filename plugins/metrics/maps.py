@@ -1,4 +1,4 @@
-"""Figures of maps: equations (1) to (9).
+"""Figures of maps: equations (1) to (10).
 
 With the map m, its weights w and the angle r of a pixel from the map's centre, after smoothing with
 the beam:
@@ -35,6 +35,11 @@ in independent pixels,
 
     relative error   (sum N_i W_i^2)^1/2 / sum N_i W_i,
     of smoothed maps from draws of noise (radial)         (9)
+
+With the matrix A = P^T Q P of a maximum-likelihood map and a signal t without noise,
+
+    template_snr     (t^T A t)^1/2,   or the amplitude of t in the map m
+                     (A t)^T m / t^T A t, to within (t^T A t)^-1/2                              (10)
 """
 
 from __future__ import annotations
@@ -54,6 +59,7 @@ from zonda.core.errors import InputError
 from zonda.core.figures import FigureMetric
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.noise_figures import matched
 from zonda.core.maps.planes import WHITE, central_diameter
 from zonda.core.numerics.sphere import ARCMIN, angle_text
 from zonda.core.signal import Signal
@@ -458,6 +464,40 @@ class PeakSnr(_OfSmoothMap):
         """Describe the figure in words."""
         noise = WHITE if self.noise == "white" else self.noise
         return f"largest |map| / noise ({noise}), {self.how()}"
+
+
+class TemplateSnr(_OfMap):
+    """Signal-to-noise ratio of a source of known shape in a maximum-likelihood map, whose noise may
+    be correlated in any way; or its amplitude in the map, equation (10).
+
+    The shape is the map of a signal without noise. What an amplitude between two scans of a survey
+    or between scales weighs is the noise model's.
+    """
+
+    of: Literal["snr", "amplitude"] = "snr"
+    """The ratio, or the amplitude of the source in the map, in units of its own."""
+    signal: str = Field("", pattern=r"^[A-Za-z0-9_]*$")
+    """Which signal of the pipeline has the shape; empty: the sky alone."""
+
+    def needs(self) -> tuple[Signal, ...]:
+        """The sky alone, unless another signal is named."""
+        return () if self.signal else sky_alone("sky")[:1]
+
+    def named_signals(self) -> tuple[str, ...]:
+        """The one that is named, and the complete one."""
+        return ("", self.signal) if self.signal else ("",)
+
+    def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
+        """Equation (10), and the error of an amplitude. Raises InputError for maps of `BinMap`."""
+        name = self.own_name()
+        template = map_of(data, name, self.signal or names[0], self.map)
+        amplitude, error = matched(template, map_of(data, name, "", self.map))
+        return (1 / error, math.nan) if self.of == "snr" else (amplitude, error)
+
+    def describe(self, data: Data, names: Sequence[str]) -> str:
+        """Describe the figure in words."""
+        what = "signal-to-noise ratio" if self.of == "snr" else "amplitude"
+        return f"{what} of {self.signal or 'the sky'} as a template, weighed by the noise model"
 
 
 class Coverage(_OfMap):

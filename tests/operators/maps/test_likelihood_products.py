@@ -1,0 +1,137 @@
+"""Products of maximum-likelihood maps: the source as a template."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import zonda
+import zonda.pipelines
+from zonda.core import cli
+from zonda.core.errors import InputError
+from zonda.core.maps.noise_figures import matched
+
+CLUSTER = Path(zonda.pipelines.__path__[0]) / "data" / "merging_cluster.fits"
+SCENE = {
+    "site": "green_bank",
+    "instrument": {
+        "name": "camera",
+        "telescope": {"name": "GBT", "diameter": "100 m"},
+        "band": {"name": "m2", "low": "75 GHz", "high": "105 GHz"},
+        "net": "100 uK s(1/2)",
+        "detectors": 40,
+        "field_of_view": "4 arcmin",
+        "main_beam_efficiency": 0.8,
+        "illumination_efficiency": 0.9,
+        "sample_rate": "50 Hz",
+    },
+    "time": "2024-02-01T05:00",
+    "target": "75 deg 20 deg",
+    "seed": 5,
+}
+RUNS = {
+    "model": {"only": ["sky"]},
+    "true": {"only": ["sky"], "filters": "none"},
+    "free": {"without": ["sky"]},
+}
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    """A cluster in white noise."""
+    steps = [
+        zonda.PointingDaisy(radius="3 arcmin", speed="50 arcsec/s", scan_duration="60 s"),
+        zonda.SkyMap(file=CLUSTER, centre="target"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.MaximumLikelihoodMap(
+            pixel="4 arcsec", half_difference=False, modes=0, free=0, tolerance=1e-6
+        ),
+        zonda.BinMap(pixel="4 arcsec", product="binned"),
+        zonda.SaveMap(),
+    ]
+    folder = tmp_path_factory.mktemp("run")
+    return zonda.Pipeline(steps, runs=RUNS).run(zonda.Scene(**SCENE), threads=1, output=folder)
+
+
+def test_a_template_in_white_noise(found):
+    """A is at most the matrix of white noise, sum (t / n)^2; a line of each detector, and slow
+    baselines that are found a little noisier than they are, take some of it."""
+    t, m, free = (found[f"{name}map"] for name in ("model/", "", "free/"))
+    one, error = matched(t, t)
+    assert one == pytest.approx(1, abs=1e-12)
+    white = np.sqrt(np.nansum((t.signal / t.noise) ** 2))
+    assert 0.9 * white < 1 / error < white
+    noise = matched(t, free)
+    assert abs(noise[0]) < 4 * error
+    # the map is linear in its data, solved to 1e-6 of a right side of 200 sigma
+    assert matched(t, m)[0] == pytest.approx(1 + noise[0], abs=0.01 * error)
+    # a mean of samples tells the same template but for structure within pixels
+    assert matched(found["true/map"], m)[1] == pytest.approx(error, rel=0.02)
+
+
+def test_the_figure(found):
+    t, m = found["model/map"], found["map"]
+    amplitude, error = matched(t, m)
+    assert zonda.measure(found, "template_snr").value == pytest.approx(1 / error, rel=1e-12)
+    figure = zonda.measure(found, "template_snr", of="amplitude", signal="model")
+    assert (figure.value, figure.error) == (amplitude, error)
+    with pytest.raises(InputError, match="maximum-likelihood map"):
+        zonda.measure(found, "template_snr", map="binned")
+
+
+def test_files_hold_it(found):
+    band = found["map"].band
+    t, m = (
+        zonda.read_map(found.output / f"{name}.fits", band=band) for name in ("model_map", "map")
+    )
+    assert matched(t, m) == pytest.approx(matched(found["model/map"], found["map"]), rel=1e-12)
+    assert "template" not in m.planes
+    assert matched(t.to("mJy/beam"), m.to("mJy/beam")) == pytest.approx(matched(t, m), rel=1e-9)
+
+
+def test_zonda_compare_prints_it(found, tmp_path, capsys):
+    files = [found.output / f"{name}.fits" for name in ("model_map", "map", "binned")]
+    rows = "S/N of the reference as a template", "its amplitude in the map"
+    amplitude, error = matched(found["model/map"], found["map"])
+    assert cli.main(["compare", *map(str, files[:2]), "--output", str(tmp_path)]) == 0
+    table = dict(re.findall(r"^(\S.*?)  +(\S.*)$", capsys.readouterr().out, re.MULTILINE))
+    assert table[rows[0]] == f"{1 / error:.4g}"
+    assert table[rows[1]] == f"{amplitude:.4g} +- {error:.2g}"
+    assert cli.main(["compare", *map(str, files[:0:-1]), "--output", str(tmp_path)]) == 0
+    assert not any(row in capsys.readouterr().out for row in rows)
+
+
+def test_what_is_no_template_is_refused(found):
+    t, m = found["model/map"], found["map"]
+    for wrong, other, cause in (
+        (t.smooth("9 arcsec"), m, "no weights"),
+        (m, m, "no weights"),
+        (t, m.to("mK_CMB"), "another unit"),
+        (t, m.with_planes(hits=m.hits + 1), "other samples"),
+        (t.with_planes(signal=0 * t.signal), m, "empty"),
+    ):
+        with pytest.raises(InputError, match=cause):
+            matched(wrong, other)
+
+
+def test_polarized_templates_have_all_three(found, tmp_path):
+    t = found["model/map"]
+    three = np.stack([t.signal, 2 * t.signal, 3 * t.signal])
+    weights = np.stack([k * t.planes["template"].values[0] for k in (1, 2, 3)])
+    nothing = np.ones((6, *t.hits.shape))
+    made = t.with_planes(
+        signal=three,
+        weights=np.stack([t.weights] * 3),
+        noise=np.stack([t.noise] * 3),
+        covariance=nothing,
+        condition=nothing[:1],
+        template=weights,
+    )
+    made.write(tmp_path / "iqu.fits")
+    again = zonda.read_map(tmp_path / "iqu.fits")
+    # S/N^2 of (1, 2, 3) t with weights (1, 2, 3) A t: 1 + 4 + 9 times that of t
+    assert matched(again, again)[1] == pytest.approx(matched(t, t)[1] / np.sqrt(14), rel=1e-12)
+    for one in (again.stokes("I"), again.smooth("9 arcsec")):
+        assert "template" not in one.planes
