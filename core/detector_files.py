@@ -4,12 +4,16 @@ or a whole observation) and TOML of sotodlib and s4sim (`Hardware.dump`).
 Both give each detector a quaternion, from the boresight's frame to the detector's. Their NETs are
 of the CMB's temperature: they become K_RJ with the mean of `cmb_slope` over the band that the file
 states, flat between its edges.
+
+Tables of `zonda noise` have NET, knee and slope by the name of the detector (`read_noise`).
 """
 
 from __future__ import annotations
 
 import tomllib
+from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +24,8 @@ from .numerics.quaternions import directions
 from .numerics.radiation import cmb_slope
 from .storage.files import first_bytes, reading, unpacked
 from .storage.hdf5_files import opened, read_columns
-from .storage.table_files import AS_TEXT, LARGEST, Table
+from .storage.table_files import AS_TEXT, LARGEST, Table, read_table
+from .types import Floats
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 """Begins every HDF5 file."""
@@ -217,3 +222,61 @@ def _convert_net(numbers: dict[str, Any], notes: list[str]) -> None:
     numbers["net"] = numbers["net"] * slope * numbers.get("correction", 1.0)
     by = ", times NET_corr," if "correction" in numbers else ""
     notes.append(f"NETs{by} are turned from K_CMB into K_RJ over the band of each detector")
+
+
+@dataclass(frozen=True)
+class NoiseTable:
+    """NET [K_RJ sqrt(s)], knee [Hz] and slope by detector."""
+
+    path: Path
+    names: dict[str, int]
+    columns: dict[str, Floats]
+
+    def of(self, detectors: list[str], place: str) -> dict[str, Floats]:
+        """The columns for these detectors. Raises InputError where one is not in the table."""
+        if lacking := [name for name in detectors if name not in self.names]:
+            text = (
+                f"{len(lacking)} of {len(detectors)} detectors are not in {self.path}, e.g."
+                f" {lacking[0]}"
+            )
+            cure = (
+                "make the table of this file: zonda noise FILE; flag detectors that it finds no"
+                " noise of"
+            )
+            raise InputError(text, place=place, cure=cure)
+        rows = np.array([self.names[name] for name in detectors], np.intp)
+        return {name: values[rows] for name, values in self.columns.items()}
+
+
+def read_noise(path: Path) -> NoiseTable:
+    """Read a table. Raises InputError where it is none, lacks a column, or has a value that cannot
+    be.
+    """
+    try:
+        return _read(path)
+    except InputError as err:
+        err.cure += "\nor make the table anew: zonda noise FILE"
+        raise
+
+
+def _read(path: Path) -> NoiseTable:
+    table = read_table(path, f"noise table {path}")
+    names, columns = table.texts("name"), {}
+    for name, otherwise in (("net", np.nan), ("knee", 0.0), ("slope", 1.0)):
+        if any(table.texts(name)):
+            unit = UNITS[name]
+            values = table.values(name) * table.factor(name, unit, unit)
+            wrong = ~np.isfinite(values) | (values < 0)
+            columns[name] = np.where(wrong, otherwise, values)  # without 1/f noise it has neither
+    net = columns.get("net", np.zeros(len(table)))
+    cure = "leave the detector out of the pipeline's file, or give it a number"
+    table.note_rows(
+        np.isnan(net),
+        lambda row: f"net of detector {names[row]} is {table.texts('net')[row]}",
+        cure,
+    )
+    if len(set(names)) < len(names):
+        twice = next(name for name, number in Counter(names).items() if number > 1)
+        table.note(None, f"detector {twice!r} is there twice", "leave one of the rows out")
+    table.check()
+    return NoiseTable(path, {name: row for row, name in enumerate(names)}, columns)

@@ -77,6 +77,30 @@ class WhiteLevel(Protocol):
         """rms of one sample at the detector, K_RJ."""
 
 
+@dataclass(frozen=True)
+class ClosedForm:
+    """Power spectrum of a component (`Observation.closed_forms`).
+
+    Attributes
+    ----------
+    spectrum
+        Of frequencies (n,) [Hz], one-sided densities (n,) [K_RJ^2/Hz], the mean over detectors.
+    shared
+        Share of it that all detectors have in common, where they do not look.
+    across
+        Of frequencies (n,) [Hz] and edges (m + 1,) [1/rad] of wave numbers across the focal plane,
+        the densities (n, m) of waves between these; None: detectors have `shared` in common.
+    """
+
+    spectrum: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    shared: float = 0.0
+    across: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]] | None = None
+
+    def __call__(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See ``spectrum``."""
+        return self.spectrum(frequency)
+
+
 class KeptStreams(MutableMapping[str, AnyFloats]):
     """Streams (n_det, n_samp) by name, whole, float64: each is made when it is asked for. An array
     that a step puts in is that array.
@@ -179,9 +203,8 @@ class Observation:
     noise_levels
         Levels of the white noise by step, in their order. Pink noise refers to the last.
     closed_forms
-        By component: power spectra on the calibrated sky, one for each step that makes it.
-        Functions of frequencies (n,) [Hz] that return one-sided densities (n,) [K_RJ^2/Hz], the
-        mean over detectors, once all steps are prepared.
+        By component: power spectra on the calibrated sky, one for each step that makes it, of use
+        once all steps are prepared.
     quoted_net
         (n_det,) ``focalplane.net`` before a step with white noise set it to what it comes to on the
         sky; None: there is none.
@@ -230,9 +253,7 @@ class Observation:
     smooth: dict[str, SmoothField] = field(default_factory=dict)
     detdata: KeptStreams = field(default_factory=KeptStreams)
     noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
-    closed_forms: dict[str, list[Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = field(
-        default_factory=dict
-    )
+    closed_forms: dict[str, list[ClosedForm]] = field(default_factory=dict)
     quoted_net: NDArray[np.float64] | None = None
     log: Log = field(default_factory=Log)
     output: Any = None

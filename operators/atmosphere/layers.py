@@ -43,7 +43,7 @@ from zonda.core.block import Block
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics.chunks import chunks
-from zonda.core.observation import Observation
+from zonda.core.observation import ClosedForm, Observation
 from zonda.core.plausibility import PWV, doubt
 from zonda.core.types import Floats
 
@@ -68,6 +68,8 @@ KNOTS = 160
 """Frequencies at which a longer spectrum is evaluated; between them it is linear in log-log. Behind
 a Gaussian beam of 100 m that errs by 0.2 % where the power is 1e-4 of the largest, by 0.4 % at
 1e-6."""
+ACROSS = 300
+"""Nodes of the integral over q where it is cut by wave numbers: right to 2 %."""
 WAVE_NUMBERS = 640
 """As `KNOTS`, of one layer's spectrum along a line, which many speeds share. The error is that of
 `KNOTS` times (160 / 640)^2.
@@ -95,15 +97,7 @@ def _along(layer: Layer) -> Callable[[Floats], Floats]:
     )
     table = np.empty(known.size)
     for n, own in enumerate(known):
-        square = own**2 + q * q
-        power = (
-            4
-            * np.pi
-            * NU
-            * layer.outer_scale ** (-2 * NU)
-            * (square + layer.outer_scale**-2) ** (-NU - 1)
-        )
-        table[n] = np.trapezoid(power * layer.aperture.transform(np.sqrt(square)) ** 2, q) / np.pi
+        table[n] = np.trapezoid(_power(layer, own**2 + q * q), q) / np.pi
 
     def along(k: Floats) -> Floats:
         found = np.exp(np.interp(np.log(np.maximum(k, known[0])), np.log(known), np.log(table)))
@@ -112,10 +106,42 @@ def _along(layer: Layer) -> Callable[[Floats], Floats]:
     return along
 
 
-def closed_form(
-    model: AtmosphereModel,
-    observation: Observation,
-) -> Callable[[Floats], Floats] | None:
+def _power(layer: Layer, square: Floats) -> Floats:
+    """P B^2 of equation (3), m2, at squared wave numbers [rad^2/m^2]."""
+    if layer.aperture is None:
+        e, w = mixture(layer.outer_scale, layer.sigma, 0.5, 1e-6)
+        waves = np.exp(-np.multiply.outer(square, e))
+        return np.asarray(np.einsum("ke,e->k", waves, 4 * np.pi * e * w))
+    power = (
+        4
+        * np.pi
+        * NU
+        * layer.outer_scale ** (-2 * NU)
+        * (square + layer.outer_scale**-2) ** (-NU - 1)
+    )
+    return np.asarray(power * layer.aperture.transform(np.sqrt(square)) ** 2)
+
+
+def layer_waves(layer: Layer, frequency: Floats, edges: Floats, speeds: Floats) -> Floats:
+    """Equation (3), of waves between ``edges`` (m + 1,) of k times the layer's distance [1/rad]:
+    (n, m) 1/Hz, the mean over 16 of the ``speeds``.
+    """
+    speeds = np.maximum(speeds[2::4], SLOWEST)
+    width = 4 * layer.sigma if layer.aperture is None else layer.aperture.diameter
+    q = np.geomspace(1e-4 / layer.outer_scale, 400 / width, ACROSS)
+    known = np.geomspace(q[0], 2 * q[-1], 4 * ACROSS)
+    power = np.log(np.maximum(_power(layer, known**2), np.finfo(np.float64).tiny))
+    found = np.zeros((len(frequency), len(edges) - 1))
+    for v in speeds.tolist():
+        k = np.hypot(2 * np.pi * frequency[:, None] / v, q)
+        part = np.exp(np.interp(np.log(k), np.log(known), power)) * np.gradient(q) * 2 / v / np.pi
+        bins = np.digitize(k * layer.distance, edges) - 1
+        for number in range(found.shape[1]):
+            found[:, number] += np.where(bins == number, part, 0.0).sum(axis=1) / len(speeds)
+    return found
+
+
+def closed_form(model: AtmosphereModel, observation: Observation) -> ClosedForm | None:
     """The spectrum of ``atmosphere`` on the calibrated sky, K_RJ^2/Hz, as a function of the
     frequency [Hz].
 
@@ -124,10 +150,10 @@ def closed_form(
     if model.fluctuation.log_normal:
         return None
 
-    def spectrum(frequency: Floats) -> Floats:
+    def added(of_layer: Callable[[Layer, Floats], Floats]) -> Floats:
         speeds = layer_speeds(observation, model.plane, model.layers)
         parts = (
-            model.emitting[k].amplitude ** 2 * layer_spectrum(model.layers[k], frequency, speeds[k])
+            model.emitting[k].amplitude ** 2 * of_layer(model.layers[k], speeds[k])
             for k in model.simulated
         )
         return np.asarray(
@@ -136,7 +162,13 @@ def closed_form(
             * sum(parts)
         )
 
-    return lambda frequency: between_knots(spectrum, frequency)
+    def spectrum(frequency: Floats) -> Floats:
+        return added(lambda layer, speeds: layer_spectrum(layer, frequency, speeds))
+
+    def across(frequency: Floats, edges: Floats) -> Floats:
+        return added(lambda layer, speeds: layer_waves(layer, frequency, edges, speeds))
+
+    return ClosedForm(lambda frequency: between_knots(spectrum, frequency), across=across)
 
 
 def between_knots(

@@ -1,12 +1,10 @@
-"""Noise of single detectors as a table: `zonda noise` measures and writes it, `LoadTOD` and
-instruments read it.
+"""Noise of single detectors as a table: `zonda noise` measures and writes it
+(`core.detector_files.read_noise` reads it).
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,75 +14,13 @@ from numpy.typing import NDArray
 from zonda.core import flags
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import TILE_DETECTORS, chunks
-from zonda.core.storage.table_files import Column, read_table, write_ecsv
+from zonda.core.storage.table_files import Column, write_ecsv
 from zonda.core.types import Floats
 
 from .recorded_scan import rows_of_bands
 from .recorded_stream import AT_ONCE, RecordedStream
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
-
-UNITS = {"net": "K s(1/2)", "knee": "Hz", "slope": ""}
-"""Columns and their SI units."""
-
-
-@dataclass(frozen=True)
-class NoiseTable:
-    """NET [K_RJ sqrt(s)], knee [Hz] and slope by detector."""
-
-    path: Path
-    names: dict[str, int]
-    columns: dict[str, Floats]
-
-    def of(self, detectors: list[str], place: str) -> dict[str, Floats]:
-        """The columns for these detectors. Raises InputError where one is not in the table."""
-        if lacking := [name for name in detectors if name not in self.names]:
-            text = (
-                f"{len(lacking)} of {len(detectors)} detectors are not in {self.path}, e.g."
-                f" {lacking[0]}"
-            )
-            cure = (
-                "make the table of this file: zonda noise FILE; flag detectors that it finds no"
-                " noise of"
-            )
-            raise InputError(text, place=place, cure=cure)
-        rows = np.array([self.names[name] for name in detectors], np.intp)
-        return {name: values[rows] for name, values in self.columns.items()}
-
-
-def read_noise(path: Path) -> NoiseTable:
-    """Read a table. Raises InputError where it is none, lacks a column, or has a value that cannot
-    be.
-    """
-    try:
-        return _read(path)
-    except InputError as err:
-        err.cure += "\nor make the table anew: zonda noise FILE"
-        raise
-
-
-def _read(path: Path) -> NoiseTable:
-    table = read_table(path, f"noise table {path}")
-    names, columns = table.texts("name"), {}
-    for name, otherwise in (("net", np.nan), ("knee", 0.0), ("slope", 1.0)):
-        if any(table.texts(name)):
-            unit = UNITS[name]
-            values = table.values(name) * table.factor(name, unit, unit)
-            wrong = ~np.isfinite(values) | (values < 0)
-            columns[name] = np.where(wrong, otherwise, values)  # without 1/f noise it has neither
-    net = columns.get("net", np.zeros(len(table)))
-    cure = "leave the detector out of the pipeline's file, or give it a number"
-    table.note_rows(
-        np.isnan(net),
-        lambda row: f"net of detector {names[row]} is {table.texts('net')[row]}",
-        cure,
-    )
-    if len(set(names)) < len(names):
-        twice = next(name for name, number in Counter(names).items() if number > 1)
-        table.note(None, f"detector {twice!r} is there twice", "leave one of the rows out")
-    table.check()
-    return NoiseTable(path, {name: row for row, name in enumerate(names)}, columns)
-
 
 COLUMNS = {
     "net": ("K s(1/2)", "white noise: rms of one second of integration"),

@@ -24,7 +24,6 @@ from zonda.core.flags import Intervals, intervals_of
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 
-from .noise_table import read_noise
 from .recorded_scan import (
     RecordedInstrument,
     instrument_of,
@@ -307,6 +306,8 @@ class RecordedFiles(Operator):
                 said = f"fitted to the file's {self.noise_model or DEFAULT_MODEL}"
         if self.noise is None:
             return columns, said
+        from zonda.core.detector_files import read_noise
+
         names = [tod.names[row] for row in rows]
         for name, values in read_noise(self.noise).of(names, f"{self.label}, {path}").items():
             column = columns.get(name, np.full(tod.n_detectors, np.append(values, 0.0)[0]))

@@ -61,15 +61,15 @@ class LikelihoodMaps(MapFromSums):
             product = product.with_planes(half_difference=self._rows(product, values))
         if stream == MAIN:
             self._tell(solution)
-        made = self._with_values(product, solution.values, stream)
-        return replace(made, noise_from="streams")
+        return self._with_values(product, solution.values, stream)
 
     def _with_values(self, product: MapProduct, values: Floats, stream: str) -> MapProduct:
         """The product of a signal with these values, (n_stokes, n_pixels), and its weights as a
         template where it is without noise.
         """
         rows = self._rows(product, self._determined(values, self.equations, product))
-        made = replace(product.with_planes(signal=rows), taken_off=self._taken)
+        made = product.with_planes(signal=rows)
+        made = replace(made, noise_from="streams", taken_off=self._taken)
         runs, signal = self.data.provenance.get("runs", {}), stream.partition("/")[2]
         if signal not in runs or not Signal(**runs[signal]).is_source:
             return made
@@ -82,7 +82,7 @@ class LikelihoodMaps(MapFromSums):
         """Normal equations of all scans, with the noise of data minus the map."""
         found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
         step = self.parameters
-        for _ in range(step.refine):
+        for _ in range(step.refine if step.noise != "simulated" else 0):
             m = self._solved(found, self.sums.first).values
             scans = []
             for one, (scan, noise) in zip(self.scans.scans, found.scans, strict=True):
@@ -98,6 +98,8 @@ class LikelihoodMaps(MapFromSums):
                     trend=step.trend,
                     fixed=noise.modes[: noise.free],
                 )
+                if step.noise != "estimated":
+                    new = replace(new, own=noise.own)  # that of a table
                 scans.append(WeighedScan(scan, new))
             found = self._of(scans)
         return found

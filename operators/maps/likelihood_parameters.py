@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
 
@@ -24,6 +25,10 @@ class LikelihoodParameters(MapParameters):
     """How many of the modes have no weight at any frequency, within baselines too."""
     trend: int = Field(1, ge=0, le=10)
     """Degree of the polynomial of each detector's scan that is taken off."""
+    noise: Literal["estimated", "simulated"] | InputPath = "estimated"  # type: ignore[assignment]
+    """Where the noise model comes from: `estimated` from the streams; `simulated`, the closed forms
+    of the scene's white noise, pink noise and atmosphere; or a table of ``zonda noise``, whose
+    white levels and spectra are taken, modes being found in the streams."""
     refine: int = Field(1, ge=0, le=5)
     """How often noise is estimated again, from data minus the map."""
     tolerance: float = Field(1e-4, gt=0, lt=0.1)
@@ -32,15 +37,24 @@ class LikelihoodParameters(MapParameters):
     """What is taken off the map of I, weighted by its hits, since the data hardly determine it;
     where absent, a plane of a TAN image, the mean of other maps."""
 
+    @field_validator("noise", mode="before")
+    @classmethod
+    def _no_noise_of_pixels(cls, value: Any) -> Any:
+        if value in ("net", "scatter"):
+            raise ValueError(f"{value} belongs to BinMap; write estimated or simulated")
+        return value
+
     @model_validator(mode="after")
     def _of_likelihood(self) -> LikelihoodParameters:
         if self.free > self.modes:
             raise ValueError(f"free: {self.free} of {self.modes} modes; set modes to {self.free}")
-        if self.contents == "hits" or self.weights == "uniform" or self.noise == "scatter":
+        if self.contents == "hits" or self.weights == "uniform":
             raise ValueError(
-                "contents: hits, weights: uniform and noise: scatter belong to BinMap: these maps"
-                " are weighted by the noise that is found in the streams"
+                "contents: hits and weights: uniform belong to BinMap: these maps are weighted by"
+                " their noise"
             )
+        if self.noise == "simulated" and "refine" in self.model_fields_set:
+            raise ValueError("refine belongs to noise: estimated; simulated noise stays as it is")
         if self.split != "scans":
             raise ValueError("half_difference is that of even and odd scans; write true or scans")
         if self.undetermined == "plane" and self.kind != "TAN":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,19 @@ from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.signal import MAIN
 from zonda.core.types import AnyFloats, Floats
 
+from .baseline_noise import BaselineNoise, estimate
 from .bin_map import Prepared
 from .binning import Weights, binnings
 from .compressed_scan import CompressedScan, RunsOfTiles, Tile, add_baselines
 from .intensity_kernel import VALUE, WEIGHT
+from .likelihood_parameters import LikelihoodParameters
 from .normal_equations import (
     Compressed,
 )
+from .stated_noise import of_scene, of_table
+
+if TYPE_CHECKING:
+    from zonda.core.detector_files import NoiseTable
 
 LOCK = threading.Lock()
 """Held while a thread adds to the sums of a scan."""
@@ -143,6 +149,45 @@ class LikelihoodScan:
                 stacklevel=4,
             )
         return np.where(np.isnan(white), np.nanmedian(white), white)
+
+    def estimate(self, white: Floats, step: LikelihoodParameters) -> BaselineNoise:
+        """Noise of the baselines, of white levels (n,) [K^2]."""
+        return estimate(
+            self.found.means,
+            self.found.counted,
+            white,
+            self.length,
+            self.observation.sample_rate,
+            modes=step.modes,
+            free=step.free,
+            trend=step.trend,
+        )
+
+    def state_noise(self, step: LikelihoodParameters, table: NoiseTable | None) -> None:
+        """Take the noise from a table, or from the scene.
+
+        Raises InputError where detectors are not in the table, PipelineError where it or the scene
+        tells no noise.
+        """
+        observation, found = self.observation, self.noise.white
+        place = f"{step.label}, {observation.name}"
+        if table is None:
+            self.noise = of_scene(self.noise, observation, self.rows, place)
+        else:
+            names = [observation.focalplane.names[row] for row in self.rows]
+            columns = table.of(names, place)
+            white = columns.get("net", np.zeros(1)) ** 2 * observation.sample_rate
+            if (white <= 0).any():
+                raise PipelineError(
+                    f"{table.path} has no net above 0 for {names[int(np.argmin(white))]}",
+                    place=place,
+                    cure="make the table anew: zonda noise FILE, or flag the detector",
+                )
+            self.noise = of_table(self.estimate(white, step), columns)
+        ratio = np.median(np.sqrt(self.noise.white / found))
+        observation.log.state(step.label, "noise model", str(step.noise))
+        text = f"{ratio:.4g}"
+        observation.log.state(step.label, "its white level over that of the streams, median", text)
 
     def give_weights(self, reference: float, spare: Any) -> None:
         """Weigh detectors by the white level that was found, in units of the inverse variance

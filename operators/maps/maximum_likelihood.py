@@ -12,7 +12,9 @@ After the first solution the noise is estimated anew from baselines minus those 
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +23,6 @@ from pydantic import PrivateAttr
 from zonda.core.data import Block, Data, Observation, Stream
 from zonda.core.errors import PipelineError
 
-from .baseline_noise import estimate
 from .bin_map import BinMap
 from .binning import Weights
 from .likelihood_maps import LikelihoodMaps
@@ -32,6 +33,9 @@ from .map_sums import MapSums
 from .normal_equations import (
     CompressedScans,
 )
+
+if TYPE_CHECKING:
+    from zonda.core.detector_files import NoiseTable
 
 LEAST_POWER, FREEDOM = 0.2, 40
 """Of slow baselines, in units of white noise: less is left where a filter has removed slow noise.
@@ -72,9 +76,19 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         found = super().check(data)
         for observation in data.observations:
             self._length(observation)
+            if self._table is not None:
+                names = np.array(observation.focalplane.names)[observation.good_detectors]
+                self._table.of(names.tolist(), f"{self.label}, {observation.name}")
         if self.width is not None and data.observations:
             self._need_all(MapLayout(self).outside(data.observations), self.label)
         return found
+
+    @cached_property
+    def _table(self) -> NoiseTable | None:
+        """The table of ``noise``."""
+        from zonda.core.detector_files import read_noise  # it imports h5py
+
+        return read_noise(self.noise) if isinstance(self.noise, Path) else None
 
     def _length(self, observation: Observation) -> int:
         """Samples of a baseline. Raises PipelineError for too few or too short baselines."""
@@ -130,16 +144,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         scan.compress(stream, self.label)
         observation, white = stream.observation, scan.white(self.label)
         for _ in range(WHITE_LEVELS):
-            scan.noise = estimate(
-                scan.found.means,
-                scan.found.counted,
-                white,
-                scan.length,
-                observation.sample_rate,
-                modes=self.modes,
-                free=self.free,
-                trend=self.trend,
-            )
+            scan.noise = scan.estimate(white, self)
             white = np.where(scan.noise.fast < STEADY, white * scan.noise.fast, white)
             if (white == scan.noise.white).all():
                 break
@@ -153,6 +158,8 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
                 place=f"{self.label}, {observation.name}",
                 cure=f"put {type(self).__name__} before filters, or leave these out",
             )
+        if self.noise != "estimated":
+            scan.state_noise(self, self._table)
         scan.give_weights(self._layout["variance"], self._spare)
         return scan
 

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
 from zonda.core.errors import placed
+from zonda.core.observation import ClosedForm
 from zonda.core.operator import Operator
 from zonda.core.plausibility import KNEE, doubt
 from zonda.core.types import Floats
@@ -157,7 +158,7 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
     spectrum.state(observation, net)
     squares = np.where(good, net**2, 0.0) / max(int(good.sum()), 1)
     observation.closed_forms.setdefault("pink", []).append(
-        lambda f: 2 * spectrum.over_white(f, squares)
+        ClosedForm(lambda f: 2 * spectrum.over_white(f, squares), pink.shared)
     )
     gain = np.sqrt([laws[slope].gain for slope in spectrum.slopes.tolist()])
     amplitude = Amplitude(pink.label, level, observation, spectrum.factors * gain)

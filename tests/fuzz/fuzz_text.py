@@ -30,11 +30,11 @@ with guided_by(
     from zonda.core.accuracy.fronts import read
     from zonda.core.array_table import read_array
     from zonda.core.configuration.time import Instant
+    from zonda.core.detector_files import read_noise
     from zonda.core.errors import ZondaError
     from zonda.core.instrument import Band
     from zonda.core.site import Site
     from zonda.operators.atmosphere.weather.sources import Table
-    from zonda.operators.io.noise_table import read_noise
     from zonda.operators.pointing.recording_files import read_recording
     from zonda.operators.pointing.schedule import read_schedule
     from zonda.operators.sky.cmb import read as read_spectrum

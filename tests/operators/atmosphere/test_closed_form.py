@@ -211,3 +211,21 @@ def test_regimes_of_three_laws():
     assert [one, two, three] == ["atmosphere", "pink", "white"]
     assert (first, second) == pytest.approx((0.005 ** (1 / 3), 1.0), rel=0.01)
     assert Spectrum(f, {"signal": f}, 1.0, 0.0, "P", 1, closed_forms={"pink": f}).regimes() == []
+
+
+@pytest.mark.parametrize("how", ["column", "layer"])
+def test_waves_across_the_focal_plane_add_up_to_the_spectrum(how):
+    """Equation (3) cut into parts, and a layer's waves of a frequency f are those above
+    2 pi f distance / V."""
+    steps = [zonda.AtmosphereLayers(pwv="5 mm", layer_response=how), zonda.Efficiency()]
+    scan = scenes.scan(5, 2000, radius=4.0)
+    scenes.run([*steps, zonda.PowerSpectrum(segment="5 s")], scan)
+    (law,) = scan.closed_forms["atmosphere"]
+    f, edges = np.geomspace(0.05, 2, 12), np.concatenate([[0], np.geomspace(10, 1e5, 20), [np.inf]])
+    parts = law.across(f, edges)
+    assert (parts >= 0).all()
+    # 300 nodes of the integral over q, 16 speeds of 64: 2 % each
+    np.testing.assert_allclose(parts.sum(axis=1), law(f), rtol=0.05, atol=1e-9 * law(f[:1])[0])
+    first = (np.cumsum(parts, axis=1) > 0.01 * parts.sum(axis=1, keepdims=True)).argmax(axis=1)
+    assert (np.diff(first) >= 0).all()
+    assert first[-1] > first[0]

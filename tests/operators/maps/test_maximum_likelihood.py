@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -187,6 +188,87 @@ def simulated(threads=1, runs=None, **how):
     return pipeline.run(zonda.Scene(**SCENE), threads=threads)
 
 
+class Keeps(MaximumLikelihoodMap):
+    """Keeps what it solves in ``kept``."""
+
+    kept: ClassVar[list[CompressedScans]] = []
+
+    def finalize(self, data):
+        self.kept[:] = [data.partial[f"{self.label} scans"]]
+        super().finalize(data)
+
+
+def of_detectors(noise, shared=0.5, **how):
+    """Map, noise model and NET on the sky of detectors that differ."""
+    steps = [
+        zonda.PointingDaisy(radius="3 arcmin", speed="50 arcsec/s", scan_duration="60 s"),
+        zonda.AtmosphereLayers(pwv="5 mm"),
+        zonda.WhiteNoise(scatter="50 %"),
+        zonda.PinkNoise(shared=shared),
+        zonda.Efficiency(),
+        Keeps(pixel="10 arcsec", half_difference=False, noise=noise, **how),
+    ]
+    data = zonda.Pipeline(steps).run(zonda.Scene(**SCENE), threads=1)
+    ((one,),) = (scans.scans for scans in Keeps.kept)
+    return data, one.noise, data.observations[0].focalplane
+
+
+def test_simulated_noise_is_that_of_the_scene():
+    (data, noise, plane), (other, found, _) = (of_detectors(n) for n in ("simulated", "estimated"))
+    # weights are rounded to 2^-24 and less of the largest
+    np.testing.assert_allclose(noise.white, plane.net**2 * 50, rtol=1e-4)
+    assert np.ptp(plane.net) > 0.5 * np.median(plane.net)
+    use = noise.frequency > 0.1
+    # half of the pink noise is each detector's own; the atmosphere adds little beside three modes
+    expected = 1 + 0.5 * 0.5 / noise.frequency[use]
+    np.testing.assert_allclose(noise.own[use], expected, rtol=0.15)
+    assert abs(noise.modes[0] @ found.modes[0]) > 0.999
+    # what is found of powers of 40 detectors in a few frequencies: 1 / sqrt(38 n)
+    freedom = noise.freedom[use]
+    np.testing.assert_array_less(np.abs(found.own / noise.own - 1)[use], 0.2 + 5 / np.sqrt(freedom))
+    one, two = data["map"], other["map"]
+    ok = one.hits > 0.3 * np.percentile(one.hits, 98)
+    assert one.signal[ok].std() == pytest.approx(two.signal[ok].std(), rel=0.1)
+    assert ("Keeps", "noise model", "simulated") in data.observations[0].log.figures()
+
+
+def test_noise_of_a_table(tmp_path):
+    """White levels and spectra are those of the table, of which a wrong one is refused."""
+    plane = of_detectors("estimated")[2]
+    knee = np.linspace(0.2, 1, 40)
+    table = tmp_path / "t.ecsv"
+    rows = [
+        f"{n} {1.5 * net} {k} 1.5" for n, net, k in zip(plane.names, plane.net, knee, strict=True)
+    ]
+    table.write_text("\n".join([HEAD, *rows]) + "\n")
+    data, noise, plane = of_detectors(table)
+    np.testing.assert_allclose(noise.white, 2.25 * plane.net**2 * 50, rtol=1e-4)
+    f = noise.frequency[5]
+    assert noise.own[5] == pytest.approx(1 + np.mean((knee / f) ** 1.5), rel=1e-6)
+    assert np.nanmedian(data["map"].noise) > 0
+    table.write_text("\n".join([HEAD, *rows[1:]]) + "\n")
+    with pytest.raises(zonda.ZondaError, match="not in") as caught:
+        of_detectors(table)
+    assert "zonda noise" in caught.value.cure
+
+
+HEAD = """# %ECSV 1.0
+# ---
+# datatype:
+# - {name: name, datatype: string}
+# - {name: net, unit: K s(1/2), datatype: float64}
+# - {name: knee, unit: Hz, datatype: float64}
+# - {name: slope, datatype: float64}
+name net knee slope"""
+
+
+def test_simulated_noise_needs_a_scene_that_states_it():
+    o, rng = observation(), np.random.default_rng(16)
+    with pytest.raises(PipelineError, match="closed form of white noise") as caught:
+        mapped(o, SIGMA * rng.normal(size=(37, o.n_samples)), noise="simulated")
+    assert "estimated" in caught.value.cure
+
+
 def test_bits_depend_neither_on_threads_nor_on_other_signals():
     one, two = simulated(), simulated(threads=2, runs={"quiet": {"only": ["white", "pink"]}})
     for plane in ("signal", "half_difference", "noise", "hits"):
@@ -225,17 +307,10 @@ def test_the_map_without_filters_is_a_mean():
 
 def test_a_compressed_scan_crosses_processes():
     """Its arrays make the same scan: maps of campaigns have the bits of one run."""
-    kept = []
-
-    class Keeps(MaximumLikelihoodMap):
-        def finalize(self, data):
-            kept.append(data.partial[f"{self.label} scans"])
-            super().finalize(data)
-
     o, rng = observation(), np.random.default_rng(4)
     noise = drifts(o, rng) + SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
     run([Keeps(pixel="15 arcsec", half_difference=False)], o, noise)
-    (scans,) = kept
+    (scans,) = Keeps.kept
     again = CompressedScans.of(scans.arrays())
     for one, other in zip(scans.scans, again.scans, strict=True):
         assert vars(one.scan).keys() == vars(other.scan).keys()
@@ -268,6 +343,8 @@ def test_files_say_what_was_taken_off(how, taken, tmp_path):
         ({"free": 2, "modes": 1}, "free"),
         ({"weights": "uniform"}, "BinMap"),
         ({"noise": "scatter"}, "BinMap"),
+        ({"noise": "simulated", "refine": 2}, "refine"),
+        ({"noise": "no_such_table.ecsv"}, "no_such_table"),
         ({"contents": "hits"}, "BinMap"),
         ({"half_difference": "detectors"}, "half_difference"),
         ({"nside": 1024, "undetermined": "plane"}, "undetermined"),

@@ -60,11 +60,12 @@ STEPS = (
             "modes": ({}, {"modes": 2}),
             "free": ({}, {"free": 0}),
             "trend": ({}, {"trend": 2}),
+            "noise": ({}, {"noise": "simulated"}),
             "refine": ({}, {"refine": 0}),
             "tolerance": ({}, {"tolerance": 1e-2}),
             "undetermined": ({}, {"undetermined": "none"}),
         },
-        refused=dict.fromkeys(("weights", "noise", "contents"), "belong to BinMap"),
+        refused=dict.fromkeys(("weights", "contents"), "belong to BinMap"),
         polarized=("condition_limit", "stokes"),
     ),
 )
