@@ -1,20 +1,26 @@
-"""Write docs/images/cluster.png, input and map of the shipped pipeline `mustang2_cluster`: python
-docs/make_images.py.
+"""Write the pictures of docs/images: python docs/make_images.py.
+
+`cluster.png` has input and map of the shipped pipeline `mustang2_cluster`, `wiener.png` what the
+first block of docs/linear.md makes.
 """
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from PIL import Image
 
-PICTURE = Path(__file__).with_name("images") / "cluster.png"
+DOCS = Path(__file__).parent
+IMAGES = DOCS / "images"
 
 
-def main() -> None:
+def cluster() -> None:
     """Run the pipeline, put two of its pictures side by side, with few colours: the file stays
     small.
     """
@@ -37,10 +43,37 @@ def main() -> None:
     for part in parts:
         both.paste(part, (left, 0))
         left += part.width
-    PICTURE.parent.mkdir(exist_ok=True)
-    both.quantize(256).save(PICTURE, optimize=True)
-    print(f"{PICTURE}: {PICTURE.stat().st_size / 1e3:.0f} kB")
+    write(both, "cluster.png")
+
+
+def wiener() -> None:
+    """Draw the maps of the page, and the sky."""
+    from matplotlib.figure import Figure
+
+    page, names = (DOCS / "linear.md").read_text(), dict[str, Any]()
+    exec(re.search(r"```python\n(.*?)```", page, re.S)[1], names)  # type: ignore[index]
+    figure = Figure((12.6, 3.6), layout="constrained")
+    data = names["data"]
+    for k, (title, made) in enumerate(
+        {
+            "maximum likelihood": data["map"],
+            "Wiener filter": names["estimate"],
+            "sky": data["truth/map"],
+        }.items()
+    ):
+        made.plot(ax=figure.add_subplot(1, 3, k + 1), title=title, limits=(-3e-3, 3e-3))
+    with BytesIO() as file:
+        figure.savefig(file, dpi=100)
+        write(Image.open(file).convert("RGB"), "wiener.png")
+
+
+def write(picture: Image.Image, name: str) -> None:
+    """Save a picture with few colours."""
+    IMAGES.mkdir(exist_ok=True)
+    picture.quantize(256).save(IMAGES / name, optimize=True)
+    print(f"{name}: {(IMAGES / name).stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":
-    main()
+    cluster()
+    wiener()

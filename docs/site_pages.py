@@ -335,10 +335,9 @@ def api_pages() -> dict[str, str]:
         lists.append((title, key, [n.rsplit(".", 1)[-1] for n in shown]))
     pages["api/units.md"] = units_page(quantities)
     pages["api/errors.md"] = page("Errors", [f"zonda.core.errors.{n}" for n in raised])
-    pages["api/testing.md"] = (
-        "# Testing\n\n::: zonda.testing\n    options: {show_root_heading: false, heading_level:"
-        " 2}\n"
-    )
+    for key, heading in (("linear", "Linear operators"), ("testing", "Testing")):
+        shown = "options: {show_root_heading: false, heading_level: 2}"
+        pages[f"api/{key}.md"] = f"# {heading}\n\n::: zonda.{key}\n    {shown}\n"
     lists += [("Units of parameters", "units", quantities), ("Errors", "errors", raised)]
     found = [operators.get(c.name) for c in operators.candidates() if c.distribution == "zonda"]
     for folder, title in folders.items():

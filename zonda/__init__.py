@@ -75,6 +75,8 @@ _WHERE = {
     "zonda.core.configuration.units",
 )
 
+_MODULES = "linear", "testing"
+
 __all__ = ["__version__", *_WHERE]
 
 if TYPE_CHECKING:
@@ -138,6 +140,8 @@ if TYPE_CHECKING:
 def __getattr__(name: str) -> Any:
     if name in _WHERE:
         return getattr(import_module(_WHERE[name]), name)
+    if name in _MODULES:
+        return import_module(f"zonda.{name}")
     if not name.startswith("_"):
         from zonda.core.registry import operators
 
@@ -156,4 +160,4 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     from zonda.core.registry import operators
 
-    return sorted({*__all__, *operators})
+    return sorted({*__all__, *_MODULES, *operators})

@@ -199,6 +199,19 @@ class Fit:
             found[d] = solved(inverse, self.basis.sums(Rows.of(row), use))[0]
         return found, spoilt
 
+    def adjoint(self, rows: Rows, masked: Mask | None = None, more: Floats | None = None) -> None:
+        """Transpose of equation (1), x - B_g^T (B_g B_g^T)^-1 (B x + ``more``), of float64 rows in
+        place; ``more``: (n_det, K), or None.
+        """
+        sums = self.basis.sums(rows, np.ones(len(self.use), bool))
+        for d, total in enumerate(sums if more is None else sums + more):
+            use, inverse = self.use, self.inverse
+            if masked is not None and masked[d].any():
+                use, inverse = self._outside(use, inverse, masked[d])
+            kept = rows.values[d, ~use]
+            self.basis.subtract(Rows.of(rows.values[d : d + 1]), solved(inverse, total[None]))
+            rows.values[d, ~use] = kept
+
     def _outside(self, use: Mask, inverse: Floats, masked: Mask) -> tuple[Mask, Floats]:
         """Samples to use outside of a mask (N,), and their inverse; those that are given where
         equation (2) forbids it.

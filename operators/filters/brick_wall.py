@@ -102,7 +102,7 @@ class HighpassPlan:
             coarse = self._spread(rows)
             done[:] = np.isfinite(coarse).all(axis=1)
             coarse[~done] = 0
-            self._subtract(rows, coarse)
+            self._subtract(rows, self._low(coarse))
         return sum(self._bridged(rows[d], bad) for d in np.flatnonzero(~done))
 
     def _bridged(self, row: AnyFloats, bad: NDArray[np.intp]) -> int:
@@ -114,7 +114,7 @@ class HighpassPlan:
         kept = row[lost]
         bridge(row, gaps)
         if self.knots:
-            self._subtract(row[None], self._spread(row[None]))
+            self._subtract(row[None], self._low(self._spread(row[None])))
         else:
             row -= self._low_exact(row.astype(np.float64)).astype(row.dtype)
         row[lost] = kept
@@ -129,9 +129,9 @@ class HighpassPlan:
             s[start : start + ABREAST] = sums[: s.shape[1], : len(part)].T
         return s
 
-    def _subtract(self, rows: AnyFloats, coarse: AnyFloats) -> None:
+    def _subtract(self, rows: AnyFloats, low: AnyFloats) -> None:
         c = np.zeros((len(rows), self._columns), rows.dtype)
-        c[:, : coarse.shape[1]] = self._low(coarse)
+        c[:, : low.shape[1]] = low
         _subtract(rows, self.first, self.weights(rows.dtype), c)
 
     @property
@@ -164,31 +164,52 @@ class HighpassPlan:
         # among them
         amplitude = np.einsum("dm,km->dk", s, self.modes)
         rest = s - np.einsum("dk,km->dm", amplitude, self.spread_modes)
-        c = np.einsum("dk,km->dm", amplitude, self.modes)
+        return np.asarray(np.einsum("dk,km->dm", amplitude, self.modes) + self._cosines(rest))
+
+    def _cosines(self, s: AnyFloats) -> AnyFloats:
+        """The part of c that cosines make of s, (n_det, M + 3) each: a symmetric matrix."""
+        c = np.zeros(s.shape)
         if self.cut:
-            folded = rest[:, 1:-1].copy()
+            folded = s[:, 1:-1].copy()
             folded[:, [0, -1]] *= 2
-            folded[:, 1] += rest[:, 0]
-            folded[:, -2] += rest[:, -1]
+            folded[:, 1] += s[:, 0]
+            folded[:, -2] += s[:, -1]
             spectrum = dct(folded, 1)
             spectrum[:, self.cut :] = 0
             spectrum[:, : self.cut] *= self.response
-            low = dct(spectrum, 1)
-            c[:, 1:-1] += low
-            c[:, 0] += low[:, 1]
-            c[:, -1] += low[:, -2]
-        return np.asarray(c)
+            c[:, 1:-1] = dct(spectrum, 1)
+            c[:, 0], c[:, -1] = c[:, 2], c[:, -3]
+        return c
+
+    def adjoint(self, rows: AnyFloats) -> None:
+        """Subtract P^T x from float64 ``rows`` (n_det, N) in place; with m the polynomials of
+        `modes`, S what they spread and R `_cosines`, that of equation (2) is
+
+            P^T x = B^T c,   c = R s + m^T (m s - S R s),   s = B x.
+        """
+        if not self.knots:
+            for row in rows:
+                low = self._cosines_exact(row)
+                row -= low + (self.polynomials @ (row - low)) @ self.polynomials
+            return
+        s = self._spread(rows)
+        c = self._cosines(s)
+        amplitude = np.einsum("dm,km->dk", s, self.modes)
+        amplitude -= np.einsum("dm,km->dk", c, self.spread_modes)
+        self._subtract(rows, c + np.einsum("dk,km->dm", amplitude, self.modes))
 
     def _low_exact(self, x: AnyFloats) -> AnyFloats:
         """P x of equation (1), directly."""
+        fit = (self.polynomials @ x) @ self.polynomials
+        return np.asarray(fit + self._cosines_exact(x - fit))
+
+    def _cosines_exact(self, x: AnyFloats) -> AnyFloats:
+        """The cosines below the cut of a row (N,)."""
         from scipy.fft import dct, idct
 
-        fit = (self.polynomials @ x) @ self.polynomials
-        if not self.cut:
-            return np.asarray(fit)
-        spectrum = dct(x - fit, type=2)
+        spectrum = dct(x, type=2)
         spectrum[self.cut :] = 0
-        return np.asarray(fit + idct(spectrum, type=2))
+        return np.asarray(idct(spectrum, type=2))
 
 
 def first_kept(n: int, frequency: float) -> int:
@@ -317,6 +338,18 @@ def bridge(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
     good[gaps] = False
     known = np.flatnonzero(good)
     row[gaps] = np.interp(gaps, known, row[known])
+
+
+def bridge_adjoint(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
+    """Transpose of `bridge`: the samples ``gaps`` are shared out to their good neighbours."""
+    known = np.delete(np.arange(row.size), gaps)
+    behind = np.searchsorted(known, gaps)
+    left, right = (known[np.clip(k, 0, known.size - 1)] for k in (behind - 1, behind))
+    share = np.where(right > left, (gaps - left) / np.maximum(right - left, 1), 0.0)
+    values = row[gaps]
+    row[gaps] = 0.0
+    np.add.at(row, left, (1 - share) * values)
+    np.add.at(row, right, share * values)
 
 
 @kernel(fastmath={"contract", "nsz"})

@@ -298,6 +298,27 @@ class CommonModeFilter(LinearFilter):
             if not state.parts or u[block.detectors].any():
                 _remove(signal, u[block.detectors], v[block.samples])
 
+    def adjoint(self, block: Block, state: Modes) -> None:
+        """The transpose of equation (3) on a block of all detectors, in float64 without means:
+        B <- B - sum_i R^-1 u_i (B^T R u_i)^T at good samples. In a source mask, what a sample is
+        filled with is given back to those that it is the mean of.
+        """
+        signal, good = block.detdata["signal"], block.observation.good_samples
+        inside, every = self._inside(block.observation), block.detectors
+        for modes in state.parts or (state,):
+            unit = np.ones(len(signal)) if modes.scale is None else modes.scale
+            use = np.asarray(modes.detectors.any(axis=0))[:, None]
+            for at in chunks(signal.shape[1], TILE_SAMPLES):
+                rows = np.where(use, signal[:, at], 0.0)
+                times = np.einsum("kd,dt->kt", modes.detectors, rows) * good[at]
+                taken = np.einsum("kd,kt->dt", modes.detectors / unit**2, times)
+                if inside is not None:
+                    masked = inside.at(every, at)
+                    filled = (unit[:, None] * taken * masked).sum(axis=0)
+                    filled /= np.maximum((use & ~masked).sum(axis=0), 1)
+                    taken = np.where(masked, 0.0, taken + use * filled / unit[:, None])
+                signal[:, at] -= taken
+
     def _modes(self, stream: Stream, model: Modes | None) -> Modes:
         """The modes of all detectors that are not flagged; see `measure`."""
         search = ModeSearch(self, stream, self._inside(stream.observation))

@@ -150,6 +150,16 @@ class Template:
             rows.values[d] = row
         return sum(number for _, number in alone)
 
+    def adjoint(self, rows: Rows, masked: Mask | None = None) -> None:
+        """Transpose of equation (3) on float64 rows in place: all samples are summed up, those that
+        are used change.
+        """
+        every, basis = np.ones(len(self.use), bool), self.trend.basis
+        sums, means = basis.sums_of_bins(rows, every, self.runs, len(self.share))
+        kept = rows.values[:, ~self.use]
+        basis.subtract(rows, solved(self.trend.inverse, sums), self.runs, means * self.share)
+        rows.values[:, ~self.use] = kept
+
     def _alone(self, rows: Rows, d: int) -> tuple[Floats, int]:
         """Row ``d`` without its template, and how many of its samples are not finite."""
         row = rows.double(slice(d, d + 1), len(self.use))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from zonda.core.types import AnyFloats, Floats
 from .baseline import Fit, polynomials
 from .brick_wall import HighpassPlan, first_kept, plan_highpass
 from .rows import SPOILT, LinearFilter, Mask, Rows
-from .source_mask import Inside, SourceMask, filter_outside
+from .source_mask import Inside, SourceMask, adjoint_outside, filter_outside
 
 ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
 
@@ -133,6 +133,10 @@ class HighpassFilter(LinearFilter):
             spoilt = bridged.plan.apply(block.detdata["signal"], bridged.bad)
             block.observation.log.count(self.label, SPOILT, spoilt)
 
+    def adjoint(self, block: Block, state: Any) -> None:
+        """The transpose of `exec`."""
+        super().adjoint(block, state)
+
     def _check_length(self, observation: Observation) -> int:
         """Samples at either end that are trimmed. Raises PipelineError where nothing is left of a
         scan.
@@ -187,6 +191,20 @@ class Bridged:
         spoilt = sum(filter_outside(row, self.bad, mask, self.act) for row, mask in pairs)
         rows.values[...] = double
         return spoilt
+
+    def adjoint(self, rows: Rows, masked: Mask | None = None) -> None:
+        """Transpose of `remove`, of float64 rows in place: of a causal filter that begins at zero,
+        the same backwards.
+        """
+        plan = self.plan
+        for d, row in enumerate(rows.values):
+            mask = None if masked is None else masked[d]
+            if plan is None:
+                adjoint_outside(row, self.bad, mask, lambda row: self.act(row[::-1]))
+            else:
+                adjoint_outside(row, self.bad, mask, lambda row: plan.adjoint(row[None]))
+        if self.trend is not None:
+            self.trend.adjoint(rows, masked)
 
 
 def sections(frequency: float, rate: float) -> Floats:

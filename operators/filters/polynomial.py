@@ -213,3 +213,21 @@ class Pieces:
             )  # through the samples on either side of the gap
             lines.subtract(rows.at(gap.start), np.stack(line, axis=1))
         return spoilt
+
+    def adjoint(self, rows: Rows, masked: NDArray[np.bool_] | None = None) -> None:
+        """Transpose of `remove` on float64 rows in place: lines of gaps act on the polynomials'
+        values at the ends of the intervals beside them.
+        """
+        ends = np.zeros((2 * len(self.parts) + 2, len(rows.values)))
+        for k, gap, lines in self.gaps:
+            n = gap.stop - gap.start
+            mean, slope = lines.sums(rows.at(gap.start), np.ones(n, bool)).T
+            ends[2 * k] += mean / 2 - slope / (2 + 2 / n)
+            ends[2 * k + 1] += mean / 2 + slope / (2 + 2 / n)
+        ends[1] += ends[0]
+        ends[-2] += ends[-1]
+        for k, (part, fit) in enumerate(zip(self.parts, self.fits, strict=True)):
+            some = np.ascontiguousarray(rows.values[:, part])
+            more = product(ends[2 * k + 1 : 2 * k + 3].T, fit.basis.functions[:, [0, -1]].T)
+            fit.adjoint(Rows.of(some), None if masked is None else masked[:, part], more)
+            rows.values[:, part] = some

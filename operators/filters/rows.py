@@ -77,6 +77,9 @@ class Removal(Protocol):
         ``masked`` (n_det, n_samp): samples in a source mask.
         """
 
+    def adjoint(self, rows: Rows, masked: Mask | None = None) -> None:
+        """Change float64 rows in place by the transpose of `remove`, of finite samples."""
+
 
 class LinearFilter(Operator):
     """Base of the filters of the signal, each detector's whole scan by itself.
@@ -122,6 +125,14 @@ class LinearFilter(Operator):
         if inside is not None:
             log.count(self.label, MASKED, n_masked, signal.size)
         log.count(self.label, SPOILT, spoilt)
+
+    def adjoint(self, block: Block, state: Any) -> None:
+        """The transpose of `exec`, of a block in float64 without means (`zonda.linear.filters`)."""
+        (fit, inside), signal = state, block.detdata["signal"]
+        for part in chunks(len(signal), ROWS):
+            detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
+            masked = None if inside is None else inside.at(detectors, block.samples)
+            fit.adjoint(Rows.of(signal[part]), masked)
 
 
 @kernel(fastmath=False)

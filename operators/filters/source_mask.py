@@ -37,7 +37,7 @@ from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import check_size, opened
 from zonda.core.types import AnyFloats, Floats
 
-from .brick_wall import bridge
+from .brick_wall import bridge, bridge_adjoint
 
 CURE = "give a two-dimensional image with a celestial WCS, 0 where there is no source"
 
@@ -211,10 +211,7 @@ def filter_outside(
     spoilt, gaps = row[lost], np.union1d(bad, lost)
     if gaps.size == row.size:
         return int(lost.size)
-    masked = np.zeros(0, np.intp) if inside is None else np.flatnonzero(inside)
-    every = np.union1d(gaps, masked)
-    if every.size == row.size:
-        masked, every = masked[:0], gaps
+    masked, every = _bridged(gaps, inside)
     before = row[masked]
     bridge(row, every)
     rest = before - row[masked]
@@ -222,6 +219,34 @@ def filter_outside(
     row[masked] += rest
     row[lost] = spoilt
     return int(lost.size)
+
+
+def adjoint_outside(
+    row: AnyFloats,
+    bad: NDArray[np.intp],
+    inside: NDArray[np.bool_] | None,
+    act: Callable[[AnyFloats], object],
+) -> None:
+    """Transpose of `filter_outside` on a float64 row in place; ``act`` is F^T."""
+    if bad.size == row.size:
+        return
+    masked, every = _bridged(bad, inside)
+    before = row[masked]
+    act(row)
+    row[masked] -= before
+    bridge_adjoint(row, every)
+    row[masked] += before
+
+
+def _bridged(
+    gaps: NDArray[np.intp], inside: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Samples in the mask, and those that are bridged; no mask where it leaves nothing."""
+    masked = np.zeros(0, np.intp) if inside is None else np.flatnonzero(inside)
+    every = np.union1d(gaps, masked)
+    if inside is not None and every.size == inside.size:
+        return masked[:0], gaps
+    return masked, every
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,10 @@ class Taper(LinearFilter):
         observation.windows[self.label] = window
         return window
 
+    def adjoint(self, block: Block, state: Floats) -> None:
+        """The same: it is diagonal."""
+        self.exec(block, state)
+
     def exec(self, block: Block, state: Floats) -> None:
         """Multiply the block's rows in place. Beside a mean M that stands beside x, W (x + M) - M
         takes the place of x.

@@ -187,11 +187,17 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
 
     def finalize(self, data: Data) -> None:
         """Solve for the map of each signal."""
+        if made := self.maps(data):
+            made.finish(data)
+
+    def maps(self, data: Data) -> LikelihoodMaps | None:
+        """What the maps of the signals are made of; None where there is no scan."""
         self._spare.clear()
         sums: MapSums | None = data.take(self.label)
         scans: CompressedScans | None = data.take(f"{self.label} scans")
-        if sums is not None and scans is not None:
-            LikelihoodMaps(self, self.grid, self._layout, sums, scans, data).finish(data)
+        if sums is None or scans is None:
+            return None
+        return LikelihoodMaps(self, self.grid, self._layout, sums, scans, data)
 
     def _weights(self, observation: Observation) -> tuple[Weights, NDArray[np.bool_]]:
         """Equal weights, until `measure` knows those of the detectors."""
