@@ -152,6 +152,9 @@ class MapArrays:
     taken_off
         What a map maker took off I, since the data hardly determine it: ``mean``, ``plane``; empty:
         nothing.
+    chi2
+        Of samples minus map, per degree of freedom, in the noise model of a maximum-likelihood map,
+        and its standard error where that is right; zeros: not known.
     beams
         FWHM [rad] of the narrowest and the widest beam in the map; zeros: not known.
     """
@@ -178,6 +181,7 @@ class MapArrays:
     beams: tuple[float, float] = (0.0, 0.0)
     square: bool = True
     taken_off: str = ""
+    chi2: tuple[float, float] = (0.0, 0.0)
     origin: Any = None
     spectral_index: float | None = None
 

@@ -231,6 +231,9 @@ class MapFile:
             cards.append(("BAND", ascii_text(band.name), "name of the band"))
         if taken := self.product.taken_off:
             cards.append(("TAKENOFF", taken, "of I, which the data hardly determine"))
+        if any(chi2 := self.product.chi2):
+            cards.append(("CHI2", chi2[0], "of samples minus map, per degree of freedom"))
+            cards.append(("CHI2ERR", chi2[1], "standard error, if noise is as modelled"))
         if (index := self.product.spectral_index) is not None:
             cards.append(("SPECINDX", index, "of the flux density, for the unit: at RESTFRQ"))
         return header_of(cards, about.history)

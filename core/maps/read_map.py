@@ -198,6 +198,7 @@ class _Reader(FileHeader):
             band=known,
             spectral_index=self.number("SPECINDX"),
             taken_off=self.text("TAKENOFF"),
+            chi2=(self.number("CHI2") or 0.0, self.number("CHI2ERR") or 0.0),
             contents=contents,
             **self.where,
         )

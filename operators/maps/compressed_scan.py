@@ -49,6 +49,9 @@ class CompressedScan:
         (n_det, n_base) int32: samples of each baseline that count.
     angles
         (2, n_runs) means of c and s over each run; (2, 0) for maps of I.
+    within
+        (n_det,) sum of the squares of the complete signal's samples about the means of their
+        baselines, K^2.
     """
 
     length: int
@@ -60,6 +63,7 @@ class CompressedScan:
     first: NDArray[np.int64]
     counted: NDArray[np.int32]
     angles: Floats = field(default_factory=lambda: np.zeros((2, 0)))
+    within: Floats = field(default_factory=lambda: np.zeros(0))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -158,7 +162,13 @@ class RunsOfTiles:
             first,
             self.counted,
             angles,
+            self.about.sum(axis=1),
         )
+
+    @property
+    def about(self) -> Floats:
+        """(n_det, n_base) sums of squares about the means of baselines."""
+        return np.maximum(self.squares - self.sums**2 / np.maximum(self.counted, 1), 0.0)
 
     @property
     def means(self) -> Floats:
@@ -172,7 +182,6 @@ class RunsOfTiles:
         that few baselines see does not change it; NaN where no two samples do. The median of chi^2
         with k degrees of freedom is k (1 - 2 / (9 k))^3 (Wilson & Hilferty 1931).
         """
-        about = np.maximum(self.squares - self.sums**2 / np.maximum(self.counted, 1), 0.0)
         freedom = np.maximum(self.counted - 1, 1)
         median = freedom * (1 - 2 / (9 * freedom)) ** 3
         most = self.counted.max(axis=1, keepdims=True)
@@ -180,7 +189,7 @@ class RunsOfTiles:
         return np.array(
             [
                 np.median(row[some] / middle[some]) if some.any() else np.nan
-                for row, middle, some in zip(about, median, enough, strict=True)
+                for row, middle, some in zip(self.about, median, enough, strict=True)
             ]
         )
 

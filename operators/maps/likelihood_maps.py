@@ -59,9 +59,15 @@ class LikelihoodMaps(MapFromSums):
                     (first.spread > 0) & (second.spread > 0), (one - two) * share, np.nan
                 )
             product = product.with_planes(half_difference=self._rows(product, values))
+        made = self._with_values(product, solution.values, stream)
         if stream == MAIN:
-            self._tell(solution)
-        return self._with_values(product, solution.values, stream)
+            made.chi2 = equations.chi_square(
+                solution.values,
+                self.right_side(equations, stream),
+                [one.data[stream] for one in self.scans.scans],
+            )
+            self._tell(solution, made.chi2)
+        return made
 
     def _with_values(self, product: MapProduct, values: Floats, stream: str) -> MapProduct:
         """The product of a signal with these values, (n_stokes, n_pixels), and its weights as a
@@ -173,7 +179,7 @@ class LikelihoodMaps(MapFromSums):
         shaped = values[:, self._seen].reshape(len(values), *product.hits.shape)
         return np.where(product.known, shaped, np.nan)
 
-    def _tell(self, solution: Solution) -> None:
+    def _tell(self, solution: Solution, chi2: Sequence[float]) -> None:
         """Log how the solution was found."""
         log, label, step = self.data.log, self.parameters.label, self.parameters
         log.state(label, "iterations", str(len(solution.history)))
@@ -184,6 +190,7 @@ class LikelihoodMaps(MapFromSums):
             if solution.smooth:
                 found = f"{len(solution.smooth.rows)}, after {solution.before} iterations"
                 log.state(label, "smooth patterns of the preconditioner", found)
+            log.state(label, "chi^2 per sample", f"{chi2[0]:.5g} +- {chi2[1]:.1g}")
             if least >= step.tolerance:
                 warnings.warn(
                     f"{label}: after {len(solution.history)} iterations the residual is"

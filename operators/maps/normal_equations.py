@@ -20,6 +20,7 @@ preconditioner. Residuals alone decide, not seconds: the map's bits depend on no
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -103,6 +104,21 @@ class WeighedScan(NamedTuple):
         scan.spread(noise.weigh(y, scan.counted) - within * y, -s, noise.free_modes, found)
         return found
 
+    def square(self, y: Floats, s: Floats) -> float:
+        """Sum d^T Q d of the complete signal, whose y and s these are."""
+        scan, noise = self
+        slow = float((y * noise.weigh(y, scan.counted)).sum())
+        return float((scan.within / noise.white).sum()) - float((s * s).sum()) + slow
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of the samples: those that neither free modes nor polynomials take."""
+        scan, noise = self
+        samples = scan.counted.sum(axis=1)
+        free = float(((noise.modes[: noise.free] ** 2).sum(axis=0) * samples).sum())
+        lines = len(noise.lines) * (np.count_nonzero(samples) - noise.free)
+        return float(samples.sum()) - free - lines
+
 
 class Solution(NamedTuple):
     """A map, and how it was found.
@@ -152,6 +168,24 @@ class NormalEquations:
     def spread(self) -> Floats:
         """(n_stokes, n_pixels) diagonal of the inverse weights; 0 without samples."""
         return self._inverse if self.n_stokes == 1 else self._inverse[[0, 3, 5]]
+
+    @property
+    def rank(self) -> float:
+        """Number of values of a map that the weights of pixels determine."""
+        places = [0] if self.n_stokes == 1 else list(PLACES)
+        return float((self._inverse[places] * self.weights[places]).sum())
+
+    def chi_square(
+        self, m: Floats, right: Floats, data: Sequence[tuple[Floats, Floats]]
+    ) -> tuple[float, float]:
+        """chi^2 = (d - P m)^T Q (d - P m) of the complete signal and a map, per degree of freedom,
+        and its standard error where Q is the inverse covariance of the noise. ``right``, ``data``:
+        as of `right_side`.
+        """
+        square = math.fsum(scan.square(*one) for scan, one in zip(self.scans, data, strict=True))
+        square += float((m * (self.apply(m) - 2 * right)).sum())
+        freedom = sum(scan.freedom for scan in self.scans) - self.rank
+        return square / freedom, math.sqrt(2 / freedom)
 
     def right_side(self, binned: Floats, data: Sequence[tuple[Floats, Floats]]) -> Floats:
         """The right side: ``binned`` P^T d / sigma^2, and y and s of the data of each scan."""

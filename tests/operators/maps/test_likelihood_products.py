@@ -1,4 +1,4 @@
-"""Products of maximum-likelihood maps: the source as a template."""
+"""Products of maximum-likelihood maps: the source as a template, chi^2."""
 
 import re
 from pathlib import Path
@@ -9,8 +9,11 @@ import pytest
 import zonda
 import zonda.pipelines
 from zonda.core import cli
+from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.maps.noise_figures import matched
+from zonda.operators.maps.grid import Looking
+from zonda.plugins.checks.scenes import run, scan, scene
 
 CLUSTER = Path(zonda.pipelines.__path__[0]) / "data" / "merging_cluster.fits"
 SCENE = {
@@ -55,6 +58,59 @@ def found(tmp_path_factory):
     return zonda.Pipeline(steps, runs=RUNS).run(zonda.Scene(**SCENE), threads=1, output=folder)
 
 
+SIGMA = 1e-3
+"""White noise of a sample, K."""
+
+
+@pytest.fixture(scope="module")
+def scanned():
+    """Three turns of 4 arcmin with white noise, and a Gaussian of 15 arcsec on the way, at rest and
+    moving by 30 arcsec half way."""
+    o = scan(37, 6000, radius=3.0)
+    o.focalplane.net[:] = SIGMA / np.sqrt(o.sample_rate)
+    maker = zonda.BinMap(pixel="3 arcsec")
+    maker.observe(Data(scene(o.instrument), [o]))
+    pixel = Looking.of(o, maker.grid).pixels(np.arange(37), 0, o.n_samples)
+    y, x = np.divmod(pixel, maker.grid.shape[1])
+    here = 3 * (x - x[0, 1500]), 3 * (y - y[0, 1500])
+    rest, moved = (np.exp(-((here[0] - s) ** 2 + here[1] ** 2) / 450) for s in (0, 30))
+    noise = SIGMA * np.random.default_rng(2).normal(size=pixel.shape)
+    return o, noise, rest, np.where(np.arange(o.n_samples) < 3000, rest, moved)
+
+
+def chi2(o, signal, **how):
+    maker = zonda.MaximumLikelihoodMap(**{"pixel": "15 arcsec", "half_difference": False, **how})
+    return run([maker], o, signal).products["map"].chi2
+
+
+@pytest.mark.parametrize("how", [{}, {"modes": 0, "free": 0}, {"modes": 5, "free": 2}])
+def test_chi_square_of_noise_from_the_model(scanned, how):
+    """sqrt(2 / n): of 37 detectors' 6000 samples, less what modes and pixels take, 0.3 %. White levels
+    are medians of the same samples: the ratio to their mean scatters by sqrt(pi / 2 - 1) of that, and
+    slow baselines, 1 in 20, are at least as noisy as white noise: 0.3 %."""
+    o, noise, *_ = scanned
+    value, error = chi2(o, noise, **how)
+    free = how.get("free", 1)
+    taken = free * o.n_samples + 2 * (37 - free)
+    assert error == pytest.approx(np.sqrt(2 / (37 * o.n_samples - taken)), rel=0.01)
+    assert value == pytest.approx(1, abs=3 * error + 0.003)
+
+
+def test_chi_square_of_wrong_models(scanned):
+    """Sources of 30 and 10 times the noise of a sample, in 1 % of the samples: within pixels as wide as
+    the source and where it moves there is more than noise. What a walk that all detectors share adds
+    to baselines is not that of independent ones."""
+    o, noise, rest, moved = scanned
+    walk = 2 * SIGMA * np.cumsum(np.random.default_rng(3).normal(size=o.n_samples))
+    for signal, how in (
+        (30 * SIGMA * rest, {"pixel": "40 arcsec"}),
+        (10 * SIGMA * moved, {"pixel": "6 arcsec"}),
+        (walk, {"modes": 0, "free": 0}),
+    ):
+        value, error = chi2(o, signal + noise, **how)
+        assert value > 1 + 10 * error, how
+
+
 def test_a_template_in_white_noise(found):
     """A is at most the matrix of white noise, sum (t / n)^2; a line of each detector, and slow
     baselines that are found a little noisier than they are, take some of it."""
@@ -88,6 +144,9 @@ def test_files_hold_it(found):
     )
     assert matched(t, m) == pytest.approx(matched(found["model/map"], found["map"]), rel=1e-12)
     assert "template" not in m.planes
+    assert m.chi2 == found["map"].chi2
+    assert t.chi2 == (0.0, 0.0)
+    assert m.chi2[0] == pytest.approx(1, abs=0.03)  # small pixels, and a source in white noise
     assert matched(t.to("mJy/beam"), m.to("mJy/beam")) == pytest.approx(matched(t, m), rel=1e-9)
 
 
