@@ -247,6 +247,19 @@ def test_what_is_not_exact_is_refused():
     for step in (Mine(), double):
         with pytest.raises(ZondaError, match="no exact adjoint"):
             zonda.linear.filters([step], o)
+
+    class Gain(zonda.Operator):
+        """A gain that falls, with its transpose."""
+
+        requires = provides = frozenset({"signal"})
+
+        def exec(self, block, state):
+            block.detdata["signal"] *= np.exp(-block.observation.seconds[block.samples])
+
+        def adjoint(self, block, state):
+            self.exec(block, state)
+
+    dot_test(zonda.linear.filters([Gain(), zonda.Detrend()], o))
     common = zonda.CommonModeFilter()
     with pytest.raises(ZondaError, match="modes"):
         zonda.linear.filters([common], o)
@@ -302,3 +315,47 @@ def test_normal_equations_are_those_of_the_pointing_and_the_noise(plate):
     np.testing.assert_array_equal(Q.matvec(d.ravel()).reshape(N_DET, N)[good], same)
     with pytest.raises(ZondaError, match="detectors"):
         zonda.linear.noise_weight(scans[0], noise[0], observation(2000))
+
+
+def test_several_bands_and_scans():
+    """Each band has its own streams, pixels and equations; scans are added up."""
+    bands = [
+        {"name": "f090", "low": "77 GHz", "high": "106 GHz", "net": "300 uK s(1/2)"},
+        {"name": "f150", "low": "130 GHz", "high": "170 GHz", "net": "360 uK s(1/2)"},
+    ]
+    telescope = {"name": "dish", "diameter": "50 m"}
+    both = {"field_of_view": "3 arcmin", "detectors": 7, "sample_rate": "20 Hz", "bands": bands}
+    efficiency = dict.fromkeys(["main_beam_efficiency", "illumination_efficiency"], 0.8)
+    camera = zonda.Instrument(name="camera", telescope=telescope, **both, **efficiency)
+    scene = zonda.Scene(
+        site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1
+    )
+    maker = zonda.MaximumLikelihoodMap(
+        pixel="15 arcsec", baseline="0.5 s", half_difference=False, undetermined="none"
+    )
+    steps = [
+        zonda.PointingDaisy(radius="1 arcmin", scan_duration="20 s", scans=2),
+        zonda.AtmosphereLayers(pwv="2 mm"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        maker,
+    ]
+    data = zonda.Pipeline(steps).run(scene, keep=["signal"], threads=1)
+    scans, noise, right = zonda.linear.compressed(data, maker, "f150")
+    own, grid = data.bands["f150"].observations, zonda.linear.grid(data, maker, "f150")
+    m = np.random.default_rng(8).normal(size=grid.n_pixels)
+    seen, total = np.zeros((2, grid.n_pixels))
+    for o, *weighed in zip(own, scans, noise, strict=True):
+        P, Q = zonda.linear.pointing(o, grid), zonda.linear.noise_weight(*weighed, o)
+        seen += (P.T @ Q @ P).matvec(m)
+        total += (P.T @ Q).matvec(data.tod("signal", o.name).ravel())
+    applied = zonda.linear.normal(scans, noise, threads=2).matvec(m)
+    assert np.abs(seen - applied).max() < 1e-10 * np.abs(applied).max()
+    assert np.abs(total - right).max() < 1e-7 * np.abs(right).max()  # rounding of the sums
+    with pytest.raises(ZondaError, match="all bands"):
+        zonda.linear.filters([zonda.CommonModeFilter(group="all")], own[0], {})
+    for band in ("", "f220"):
+        with pytest.raises(ZondaError, match="band"):
+            zonda.linear.grid(data, maker, band)
+        with pytest.raises(ZondaError, match="band"):
+            zonda.linear.compressed(data, maker, band)

@@ -53,7 +53,8 @@ from zonda.operators.maps.normal_equations import (
 from zonda.operators.maps.pointing_matrix import Pointing
 
 __all__ = [
-    "binning", "compressed", "filters", "grid", "modes", "noise_weight", "normal", "pointing"
+    "Filters", "Pointing", "binning", "compressed", "filters", "grid", "modes", "noise_weight",
+    "normal", "pointing",
 ]  # fmt: skip
 
 Steps = Pipeline | Sequence[Operator]
@@ -65,8 +66,18 @@ def grid(data: Data, maker: BinMap, band: str = "") -> Grid:
 
     ``band``: of a camera with several.
     """
-    layout, own = MapLayout(maker), data.bands[band] if band else data
-    return layout.grid(layout.place(own.observations, {}))
+    layout = MapLayout(maker)
+    return layout.grid(layout.place(of_band(data, band, "zonda.linear.grid").observations, {}))
+
+
+def of_band(data: Data, band: str, place: str) -> Data:
+    """The data of a band. Raises InputError for one that there is not, or that is not named."""
+    every = data.bands or {"": data}
+    if band not in every:
+        text = f"there is no band {band!r}" if band else "these data have several bands"
+        cure = f"give one of {', '.join(every)}" if data.bands else "leave band out"
+        raise InputError(text, place=place, cure=cure)
+    return every[band]
 
 
 def pointing(
@@ -342,7 +353,8 @@ def compressed(
     """
     own = {**dict(maker), "name": maker.label}
     step = _Unsolved.model_construct(maker.model_fields_set, **own)
-    made: LikelihoodMaps = map_streams(data, [step])["_".join(["equations", *band.split()])]
+    of_band(data, band, "zonda.linear.compressed")
+    made: LikelihoodMaps = map_streams(data, [step])[f"equations_{band}" if band else "equations"]
     right = made.right_side(made.equations, MAIN)
     scans, noise = zip(*made.equations.scans, strict=True)
     return list(scans), list(noise), right.ravel()
