@@ -77,7 +77,8 @@ def plan(
     whole = [label for label in structure.operators if label in drop]
     remaining = _without(pipeline, structure, whole) if whole else structure
     names = [band.name for band in scene.instrument.bands] or [""]
-    bands = {name: _in_band(name, file, drop, structure, remaining) for name in names}
+    threads = threads or available_threads()
+    bands = {name: _in_band(name, file, drop, structure, remaining, threads) for name in names}
     every = [d for band in bands.values() for d in band.decided]
     decided = decide(
         [band.decided for band in bands.values()],
@@ -96,7 +97,7 @@ def plan(
             name: replace(bands[name], decided=tuple(own))
             for name, own in zip(names, decided, strict=True)
         },
-        memory_of(contexts, Settings(threads or available_threads(), free, dtype)),
+        memory_of(contexts, Settings(threads, free, dtype)),
     )
     return replace(made, timing=_measured(made.apply(file), contexts)) if measure else made
 
@@ -107,12 +108,13 @@ def _in_band(
     drop: Sequence[str],
     structure: Structure,
     remaining: Structure,
+    threads: int,
 ) -> PlanOfBand:
     """Effects in one band, all in full, and the budget. ``remaining``: the structure without the
     operators that are dropped as a whole.
     """
     pipeline = file.pipeline()
-    context = context_of(pipeline, file.scene(), structure, name)
+    context = context_of(pipeline, file.scene(), structure, name, threads)
     joined = context.joined
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
     allowed = {m: v for m, v in budget.items() if m in context.metrics}
@@ -121,7 +123,7 @@ def _in_band(
     found.append(Decided("pipeline", _precision(pipeline.precision, context)))
     check_droppable(drop, found, [o.label for o in pipeline.operators])
     if whole := [label for label in structure.operators if label in drop]:
-        left = context_of(file.pipeline(), file.scene(), remaining, name)
+        left = context_of(file.pipeline(), file.scene(), remaining, name, threads)
         found = [d for d in found if d.operator not in whole]
         found += [Decided(o, _everything_of(o, estimates, context, left)) for o in whole]
         context = left

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
 
@@ -16,7 +17,7 @@ from ..registry import RegistryError, planning
 from .bounds import Cost, Estimate, Traits
 
 if TYPE_CHECKING:
-    from ..data import Observation
+    from ..data import Data, Observation
     from .bounds import Context
 
 
@@ -93,6 +94,8 @@ class Planning(Generic[O]):
         Bytes of its `memory`: for every observation, and for each detector and each sample of it.
     per_pixel
         Bytes that an output holds besides while it acts, for each pixel of the largest map.
+    shortest
+        Shortest scan that the step takes, s; a property, if it depends on the parameters.
     smaller
         Advice that lessens its `memory`, in a few words (``choose a larger pixel``), for a run that
         does not fit.
@@ -107,6 +110,13 @@ class Planning(Generic[O]):
     per_sample: ClassVar[int] = 0
     per_pixel: ClassVar[int] = 0
     smaller: ClassVar[str] = ""
+    if TYPE_CHECKING:
+
+        @property
+        def shortest(self) -> float: ...
+
+    else:
+        shortest: ClassVar[float] = 0.0
 
     def __init__(self, operator: O) -> None:
         self.operator = operator
@@ -159,6 +169,22 @@ class Planning(Generic[O]):
         """
         return (self.memory(observation),) * 2
 
+    def states(self, observations: Sequence[Observation]) -> list[str]:
+        """Statements about the work on all scans, for `zonda plan`."""
+        return []
+
+    def finishing(
+        self,
+        seconds: float,
+        part: Data,
+        observations: Sequence[Observation],
+    ) -> tuple[float, str]:
+        """CPU seconds of `Operator.finalize` in the run, of so many ``seconds`` in a run over a
+        ``part`` of it; and what they are estimated from, in words, where they grow with the
+        samples.
+        """
+        return seconds, ""
+
     @property
     def pixels(self) -> int:
         """Pixels of the map that it makes."""
@@ -175,6 +201,11 @@ class Planning(Generic[O]):
         goes on to the next.
         """
         return False
+
+
+def samples_in(observations: Iterable[Observation]) -> int:
+    """Detectors x samples of all of them."""
+    return sum(o.n_detectors * o.n_samples for o in observations)
 
 
 def planning_of(operator: Operator) -> Planning[Any]:

@@ -59,11 +59,16 @@ def samples_of(pipeline: Pipeline, scene: Scene) -> int:
     return round(total)
 
 
-def observed(operators: Sequence[Operator], scene: Scene, band: str = "") -> Data:
+def observed(
+    operators: Sequence[Operator],
+    scene: Scene,
+    band: str = "",
+    threads: int = 1,
+) -> Data:
     """Observations of the operators; of a camera of several bands those of this ``band``, its
     detectors where they are in the whole camera.
     """
-    data = Data(scene=scene)
+    data = Data(scene=scene, threads=threads)
     if band:
         for operator in filter(points, operators):
             operator.observe(data)
@@ -77,7 +82,13 @@ def observed(operators: Sequence[Operator], scene: Scene, band: str = "") -> Dat
     return data
 
 
-def context_of(pipeline: Pipeline, scene: Scene, structure: Structure, band: str = "") -> Context:
+def context_of(
+    pipeline: Pipeline,
+    scene: Scene,
+    structure: Structure,
+    band: str = "",
+    threads: int = 1,
+) -> Context:
     """Point the telescope and gather what the bounds need, of one band where the camera has
     several.
 
@@ -87,7 +98,7 @@ def context_of(pipeline: Pipeline, scene: Scene, structure: Structure, band: str
     reading = [o for o in operators if planning_of(o).reads_streams]
     readers = frozenset(o.label for o in reading)
     others = [o for o in operators if o.label not in readers and not isinstance(o, Output)]
-    data = observed(others, scene, band)
+    data = observed(others, scene, band, threads)
     chain = chain_of(pipeline, structure)
     note_signals(data.observations, chain.components, chain.signals)
     shown = _some(data.observations)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from tempfile import TemporaryDirectory
 from typing import ClassVar
 
@@ -26,7 +26,7 @@ from ..run.views import View
 from ..signal import Signal
 from ..types import Floats
 from .bounds import Context
-from .planning import planning_of
+from .planning import planning_of, samples_in
 
 POINTED = 200
 """Bytes for one sample of one observation, whatever the detectors: times, boresight, flags."""
@@ -85,12 +85,14 @@ def memory_of(contexts: Sequence[Context], settings: Settings) -> float:
 @dataclass(frozen=True)
 class Timing:
     """CPU seconds of a run, by step: set-up, and what grows with the samples. Imports and planning
-    are not counted, nor that streams may be made again if memory is short.
+    are not counted, nor that streams may be made again if memory is short. ``basis``: of estimates
+    of single steps, in words.
     """
 
     setup: Mapping[str, float]
     growing: Mapping[str, float]
     slice: str
+    basis: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def total(self) -> float:
@@ -107,7 +109,8 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
     other; each is run `TIMES` times, of which the least time of a step counts.
 
     A step's time is s_p + s_o n + r N: s_p once (outputs, finishing), s_o for each of n scans,
-    r for each of N detectors x samples. ``observations``: of the whole pipeline, every band's.
+    r for each of N detectors x samples; `Planning.finishing` says where finishing grows with N.
+    ``observations``: of the whole pipeline, every band's.
 
     Raises
     ------
@@ -116,29 +119,38 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
     """
     first, bands = observations[0], {o.instrument.band.name for o in observations}
     rate = first.n_detectors * len(bands) * first.sample_rate
-    seconds = min(max(SAMPLES / rate, LEAST_SECONDS), SECONDS, first.duration)
+    steps = {o.label: planning_of(o) for o in file.pipeline().operators}
+    least = max(planning.shortest for planning in steps.values())
+    seconds = min(max(SAMPLES / rate, LEAST_SECONDS, SHORTER * least), SECONDS, first.duration)
     every = max(1, math.ceil(seconds * rate / SAMPLES))
-    few, short = _least(file, Slice(seconds=seconds / SHORTER, every=every), outputs=False)
-    many, long = _least(file, Slice(seconds=seconds, every=every), outputs=True)
+    shorter = min(max(seconds / SHORTER, least), seconds)
+    less, short = _least(file, Slice(seconds=shorter, every=every), outputs=False)
+    part, long = _least(file, Slice(seconds=seconds, every=every), outputs=True)
+    few, many, samples = (
+        samples_in(o) for o in (less.observations, part.observations, observations)
+    )
     scans = len(observations) / len(bands)
-    samples = sum(o.n_detectors * o.n_samples for o in observations)
-    setup: dict[str, float] = {}
-    growing: dict[str, float] = {}
-    for label, (once, each) in long.items():
-        less = short.get(label, np.zeros(2))[1]
-        slope = max(each - less, 0.0) / (many - few) if many > few else 0.0
+    setup, growing, basis = dict[str, float](), dict[str, float](), dict[str, str]()
+    for label, (once, each, end) in long.items():
+        before = short.get(label, np.zeros(3))[1]
+        slope = max(each - before, 0.0) / (many - few) if many > few else 0.0
         growing[label] = float(slope * samples)
-        setup[label] = float(once + scans * max(min(less, each) - slope * few, 0.0))
+        setup[label] = float(once + scans * max(min(before, each) - slope * few, 0.0))
+        planning = steps.get(label)
+        end, words = planning.finishing(float(end), part, observations) if planning else (end, "")
+        (growing if words else setup)[label] += float(end)
+        if words:
+            basis[label] = words
     words = f"{seconds:.3g} s of the first scan"
-    return Timing(setup, growing, words + (f", every {every}th detector" if every > 1 else ""))
+    words += f", every {every}th detector" if every > 1 else ""
+    return Timing(setup, growing, words, basis)
 
 
-def _least(file: PipelineFile, cut: Slice, outputs: bool) -> tuple[int, dict[str, Floats]]:
-    """Samples of a slice, and the least CPU seconds of each step in `TIMES` runs: once per run, and
-    once per scan. Outputs, if wanted, act in the first run.
+def _least(file: PipelineFile, cut: Slice, outputs: bool) -> tuple[Data, dict[str, Floats]]:
+    """Data of a slice, and the least CPU seconds of each step in `TIMES` runs: once per run, once
+    per scan, and when products are finished. Outputs, if wanted, act in the first run.
     """
     least: dict[str, Floats] = {}
-    samples = 0
     for k in range(TIMES):
         shown = outputs and k == 0
         steps = [s for s in file.steps if shown or not isinstance(s.operator, Output)]
@@ -148,13 +160,12 @@ def _least(file: PipelineFile, cut: Slice, outputs: bool) -> tuple[int, dict[str
             data = part.pipeline().run(part.scene(), output=folder, threads=1)
         found: dict[str, Floats] = {}
         for label, stage, used in data.provenance["timings"]:
-            once = stage in ("observe", "finalize")
-            found[label] = found.get(label, 0.0) + np.array([once, not once]) * used
+            place = {"observe": 0, "finalize": 2}.get(stage, 1)
+            found.setdefault(label, np.zeros(3))[place] += used
         del found["Slice"]
         for label, each in found.items():
             least[label] = np.minimum(least.get(label, each), each)
-        samples = sum(o.n_detectors * o.n_samples for o in data.observations)
-    return samples, least
+    return data, least
 
 
 class Slice(Operator):

@@ -15,6 +15,7 @@ from ..operator import labels
 from ..tables import aligned
 from .bounds import Context, figure, kelvin
 from .decide import Decided
+from .planning import planning_of
 from .prediction import Timing
 from .structure import Structure
 
@@ -124,6 +125,13 @@ class PlanOfBand:
         own = self.context
         return own.depth.sample, own.map_noise, own.coverage.hits if own.coverage else 0.0
 
+    @property
+    def states(self) -> dict[str, list[str]]:
+        """Statements of steps about their work, by label."""
+        scans = self.context.observations
+        every = {o.label: planning_of(o).states(scans) for o in self.context.operators}
+        return {label: lines for label, lines in every.items() if lines}
+
     def short(self) -> list[Row]:
         """Rows for headers."""
         found = []
@@ -140,6 +148,7 @@ class PlanOfBand:
             "noise": {"sample": sample, "map_pixel": pixel, "samples_per_pixel": hits},
             "budget": {m: {"limit": v, "spent": self.spent[m]} for m, v in self.limits.items()},
             "joins_bands": self.joined,
+            "states": self.states,
             "effects": [self._effect(d) for d in self.decided],
         }
 
@@ -167,6 +176,7 @@ class PlanOfBand:
                 " that nothing is coarsened"
             )
         said += [f"{name} {what}: {why}" for name, what, _, why in omitted]
+        said += [f"{label}: {line}" for label, lines in self.states.items() for line in lines]
         sums = [
             (name, *(figure(m, values[m]) for m in self.limits))
             for name, values in (("added by this plan", self.spent), ("budget", self.limits))
@@ -335,6 +345,7 @@ class Plan:
             each = {label: self.timing.of(label) for label in self.timing.growing}
             used = ", ".join(f"{label} {duration(s)}" for label, s in each.items() if s > 0)
             last.append(wrapped(f"CPU time: {used}"))
+            last += [wrapped(f"{label}: {words}") for label, words in self.timing.basis.items()]
         last.append(("" if "" in self.bands else "all bands: ") + str(self.summary))
         return "\n\n".join([*parts, "\n".join(last)])
 
@@ -378,6 +389,7 @@ def as_dict_of(memory: float, timing: Timing | None) -> dict[str, Any]:
         "set_up": dict(timing.setup),
         "with_samples": dict(timing.growing),
         "slice": timing.slice,
+        "basis": dict(timing.basis),
     }
     return {"bytes": memory, **(times or {})}
 

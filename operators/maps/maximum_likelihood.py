@@ -62,12 +62,14 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
     unfiltered: ClassVar[bool] = True
 
     _samples: tuple[int, int] = PrivateAttr((0, 0))
+    _at_once: int = PrivateAttr(1)
 
     def observe(self, data: Data) -> None:
-        """Lay out one grid for all observations, and count their samples."""
+        """Lay out one grid for all observations, and count their samples and threads."""
         super().observe(data)
         every = [(o.n_detectors * o.n_samples, o.n_samples) for o in data.observations]
         self._samples = sum(n for n, _ in every), sum(n for _, n in every)
+        self._at_once = min(data.threads, len(every))
 
     def check(self, data: Data) -> list[str]:
         """See `BinMap.check`. Raises PipelineError for a width that leaves samples outside, and for

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
-from zonda.core.data import Observation
+from zonda.core.data import Data, Observation
 from zonda.core.numerics.projection import boresights
 from zonda.core.plan.bounds import Traits
-from zonda.core.plan.planning import Planning
+from zonda.core.plan.planning import Planning, samples_in
 
 from .bin_map import BinMap
 from .coverage import COUNTS
 from .grid import in_frame
-from .maximum_likelihood import MaximumLikelihoodMap
+from .maximum_likelihood import SHORTEST, MaximumLikelihoodMap
 
 HEALPY = 32_000_000
 """Bytes of the library."""
@@ -94,26 +95,50 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
     smaller = "choose a larger pixel or a longer baseline"
 
     def memory(self, observation: Observation) -> int:
-        """Six bytes a run (22 with I, Q and U), twice while those of a scan are put in order; sums
-        of baselines and free modes; and its compiled code.
+        """The compressed scans; twice the runs of a scan while these are put in order, sums and
+        spectra of its baselines; and its compiled code.
         """
-        step = self.operator
+        step, signals = self.operator, len(observation.signals)
+        samples = observation.n_samples * observation.n_detectors
+        own = self.of_run * samples * self.runs(observation)
+        own += (60 + 8 * signals) * self.baselines(observation)
+        own += 16 * signals * step.free * observation.n_samples
+        return super().memory(observation) + self.compressed(observation) + int(own) + COMPILED
+
+    def compressed(self, observation: Observation) -> int:
+        """Bytes of all compressed scans: 6 r N + (12 + 8 n) N / L + 8 n k T for n signals and k
+        free modes of N samples at T instants, r runs a sample; 22 r N with I, Q and U.
+        """
+        step, signals = self.operator, len(observation.signals)
         samples, instants = step._samples
-        signals, length = len(observation.signals), max(step.baseline * observation.sample_rate, 1)
-        twice = samples + observation.n_samples * observation.n_detectors
-        runs = (22 if self.polarized else 6) * twice * self.runs(observation)
-        sums = (40 + 16 * signals) * samples / length + 16 * signals * step.free * instants
-        return super().memory(observation) + int(runs + sums) + COMPILED
+        baselines = samples / max(step.baseline * observation.sample_rate, 1)
+        free = 8 * signals * step.free * instants
+        return int(
+            self.of_run * samples * self.runs(observation) + (12 + 8 * signals) * baselines + free
+        )
+
+    @property
+    def of_run(self) -> int:
+        """Bytes of a run."""
+        return 22 if self.polarized else 6
 
     def finished(self, observation: Observation) -> tuple[int, int]:
         """Maps of conjugate gradients and of smooth patterns, and weights with their inverse; of a
-        half difference those of the whole and of one half, too.
+        half difference those of the whole and of one half, too. Each thread has baselines and maps
+        of a scan.
         """
         most, product = super().finished(observation)
         stokes, weights = (3, 12) if self.polarized else (1, 2)
         halves = 2 * (stokes + weights) * bool(self.operator.half_difference)
-        maps = 15 * stokes + weights + 6 + halves
-        return most + 8 * maps * self.pixels, product + COMPILED
+        at_once, free = self.operator._at_once, self.operator.free
+        maps = (15 + 3 * at_once) * stokes + weights + 6 + halves
+        scan = int(50 * self.baselines(observation)) + 32 * free * observation.n_samples
+        return most + 8 * maps * self.pixels + at_once * scan, product + COMPILED
+
+    def baselines(self, observation: Observation) -> float:
+        """Baselines of all detectors in a scan."""
+        length = max(self.operator.baseline * observation.sample_rate, 1)
+        return observation.n_detectors * observation.n_samples / length
 
     @property
     def polarized(self) -> bool:
@@ -131,6 +156,49 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         way = float(np.sqrt((forward**2).sum(axis=0)).mean()) if forward.size else 0.0
         crossed = 4 / math.pi * way / (self.traits(observation).pixel or way or 1.0)
         return min(1.0, 1.1 * crossed + 1 / max(step.baseline * observation.sample_rate, 1))
+
+    @property
+    def shortest(self) -> float:
+        """One that its noise is found from, and a baseline more, s."""
+        return self.operator.baseline * (SHORTEST + self.operator.trend + 1)
+
+    def states(self, observations: Sequence[Observation]) -> list[str]:
+        """Readings, the size of the compressed scans, and solutions."""
+        step, longest = self.operator, max(observations, key=lambda o: o.n_samples * o.n_detectors)
+        size, runs = self.compressed(longest), self.runs(longest)
+        return [
+            "each scan is read twice: for runs, baselines and noise; for sums and free modes",
+            f"compressed scans take {size / 1e9:.3g} GB, at {runs:.2g} runs a sample"
+            f" ({self.of_run} bytes each) and baselines of {step.baseline:g} s",
+            f"{self._solutions(longest)} solutions by conjugate gradients, {step.refine} of them"
+            " for the noise",
+        ]
+
+    def finishing(
+        self,
+        seconds: float,
+        part: Data,
+        observations: Sequence[Observation],
+    ) -> tuple[float, str]:
+        """Iterations of all solutions, as many as over the slice."""
+        step, label = self.operator, self.operator.label
+        few, many = samples_in(part.observations), samples_in(observations)
+        found = {what: text for who, what, text in part.log.figures() if who.startswith(label)}
+        number = int(found["iterations"])
+        solutions = self._solutions(part.observations[0])
+        each = seconds / max(few * number * solutions, 1)
+        return (
+            seconds * many / max(few, 1),
+            f"about {number} iterations for each of {solutions} solutions, as over the slice, at"
+            f" {1e9 * each:.2g} ns a sample; more where scans overlap less or tolerance is less"
+            f" than {step.tolerance:g}",
+        )
+
+    def _solutions(self, observation: Observation) -> int:
+        """Solutions over all samples; two halves are one."""
+        step = self.operator
+        signals = len({*observation.signals} - observation.unfiltered)
+        return step.refine + signals * (1 + bool(step.half_difference))
 
     def sweeps(self, observation: Observation) -> int:
         """One reading finds runs and baselines."""
