@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 
 import zonda
 import zonda.linear
+from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.flags import INVALID, TURNAROUND
-from zonda.plugins.checks.scenes import run, scan
+from zonda.plugins.checks.scenes import run, scan, scene
 
 N_DET, N = 37, 3000
 POLARIZED = np.resize(np.radians([0, 90, 45, 135]), N_DET)
@@ -30,8 +31,12 @@ def observation(samples=N, flagged=True, plate=False):
     return o
 
 
+def pointed(o):
+    return Data(scene(o.instrument), [o])
+
+
 def grid_of(o, **how):
-    return zonda.linear.grid(run([], o, np.zeros((N_DET, o.n_samples))), zonda.BinMap(**how))
+    return zonda.linear.grid(pointed(o), zonda.BinMap(**how))
 
 
 def dot_test(A, seed=0):
@@ -69,6 +74,28 @@ def test_the_transpose_of_pointing(grid, interpolation, stokes):
     assert used == pytest.approx(1, abs=1e-12)  # of a constant sky
     share = used.size / seen.size
     assert 0.1 < share < 0.9 if "outside" in grid else share > 0.94
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    samples=st.integers(1, 200),
+    gaps=st.lists(st.integers(0, 199), max_size=5),
+    width=st.floats(1, 9),
+    bilinear=st.booleans(),
+    polarized=st.booleans(),
+)
+def test_pointing_of_any_scan_and_width(samples, gaps, width, bilinear, polarized):
+    """The transpose, also where nothing is seen; no sample sees more than one pixel's worth."""
+    o = observation(samples, flagged=False)
+    o.flags[[gap % samples for gap in gaps]] = INVALID
+    g = zonda.linear.grid(pointed(o), zonda.BinMap(pixel="20 arcsec", width=f"{width} arcmin"))
+    how = ("bilinear" if bilinear else "nearest"), ("IQU" if polarized else "I")
+    P, rng = zonda.linear.pointing(o, g, *how), np.random.default_rng(samples)
+    m, d = rng.normal(size=P.shape[1]), rng.normal(size=P.shape[0])
+    size = np.linalg.norm(d) * np.linalg.norm(m) * np.sqrt(P.shape[0])
+    assert abs(d @ P.matvec(m) - P.rmatvec(d) @ m) <= 1e-13 * size
+    sums = P.matvec(np.ones(P.shape[1]) * (np.arange(P.shape[1]) < g.n_pixels))
+    assert np.abs(sums[sums != 0] - 1).max(initial=0) < 1e-12
 
 
 @pytest.mark.parametrize("grid", ["TAN", "CAR", "HEALPix"])
@@ -265,8 +292,16 @@ def test_what_is_not_exact_is_refused():
         zonda.linear.filters([common], o)
     with pytest.raises(ZondaError, match="modes of shape"):
         zonda.linear.filters([common], o, np.ones((1, 3)))
-    with pytest.raises(ZondaError, match="one CommonModeFilter"):
-        zonda.linear.filters([common, common], o, np.ones((1, N_DET)))
+    of_wafers, of_mean = (
+        zonda.CommonModeFilter(**how) for how in ({"group": "wafer"}, {"method": "mean"})
+    )
+    for steps in ([common, common], [of_wafers], [of_mean], [zonda.Detrend()]):
+        with pytest.raises(ZondaError, match="one CommonModeFilter"):
+            zonda.linear.filters(steps, o, np.ones((1, N_DET)))
+    with pytest.raises(ZondaError, match="not an operator"):
+        zonda.linear.filters([None], o)
+    with pytest.raises(ZondaError, match="12 samples"):
+        zonda.linear.modes([common], o, np.ones((3, 4)))
     grid = grid_of(o, pixel="10 arcsec")
     with pytest.raises(ZondaError, match="'cubic'"):
         zonda.linear.pointing(o, grid, "cubic")
@@ -327,7 +362,7 @@ def test_several_bands_and_scans():
     both = {"field_of_view": "3 arcmin", "detectors": 7, "sample_rate": "20 Hz", "bands": bands}
     efficiency = dict.fromkeys(["main_beam_efficiency", "illumination_efficiency"], 0.8)
     camera = zonda.Instrument(name="camera", telescope=telescope, **both, **efficiency)
-    scene = zonda.Scene(
+    night = zonda.Scene(
         site="green_bank", instrument=camera, time="2024-11-25T07:00", target="05h +20d", seed=1
     )
     maker = zonda.MaximumLikelihoodMap(
@@ -340,7 +375,7 @@ def test_several_bands_and_scans():
         zonda.Efficiency(),
         maker,
     ]
-    data = zonda.Pipeline(steps).run(scene, keep=["signal"], threads=1)
+    data = zonda.Pipeline(steps).run(night, keep=["signal"], threads=1)
     scans, noise, right = zonda.linear.compressed(data, maker, "f150")
     own, grid = data.bands["f150"].observations, zonda.linear.grid(data, maker, "f150")
     m = np.random.default_rng(8).normal(size=grid.n_pixels)

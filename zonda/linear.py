@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.sparse.linalg import LinearOperator
 
+from zonda.core.assembly import arguments
 from zonda.core.block import Block
 from zonda.core.data import Data, Observation
 from zonda.core.errors import InputError, PipelineError
@@ -136,14 +137,12 @@ class Filters(LinearOperator):
         self, pipeline: Steps, observation: Observation, models: Mapping[str, Any]
     ) -> None:
         self.observation, self.models = own_copy(observation), models
-        steps = pipeline.operators if isinstance(pipeline, Pipeline) else pipeline
-        every = [step for step in steps if filters_signals(step)]
-        for label, step in zip(labels(every), every, strict=True):
+        given = pipeline.operators if isinstance(pipeline, Pipeline) else pipeline
+        steps = [o for o in arguments.steps(given, "zonda.linear") if filters_signals(o)]
+        named = [*zip(labels(steps), steps, strict=True)]
+        for label, step in named:
             check_adjoint(step, label, observation)
-        self.steps = [
-            (label, step, step.prepare(self.observation))
-            for label, step in zip(labels(every), every, strict=True)
-        ]
+        self.steps = [(label, step, step.prepare(self.observation)) for label, step in named]
         samples = observation.n_detectors * observation.n_samples
         super().__init__(np.float64, (samples, samples))  # type: ignore[call-arg]
 
@@ -181,10 +180,13 @@ class Filters(LinearOperator):
 
     def _block(self, d: Floats) -> Block:
         """All of a stream, a copy, as one block."""
-        n_det, n_samp = self.observation.n_detectors, self.observation.n_samples
-        array = np.array(d, np.float64).reshape(n_det, n_samp)
-        every = slice(0, n_det), slice(0, n_samp)
-        return Block(self.observation, *every, {MAIN: array}, dtype=np.float64)
+        scan = self.observation
+        if np.size(d) != self.shape[0]:
+            text = f"a stream of {np.size(d)} samples for {scan.n_detectors} x {scan.n_samples}"
+            raise InputError(text, place="zonda.linear", cure="give data.tod() of this scan")
+        array = np.array(d, np.float64).reshape(scan.n_detectors, scan.n_samples)
+        every = slice(0, scan.n_detectors), slice(0, scan.n_samples)
+        return Block(scan, *every, {MAIN: array}, dtype=np.float64)
 
 
 def own_copy(observation: Observation) -> Observation:
@@ -253,9 +255,10 @@ def filters(pipeline: Steps, observation: Observation, modes: Any = None) -> Fil
         made.models = modes
     elif modes is not None:
         array = np.array(modes, np.float64, ndmin=2)
-        if len(singular) != 1 or not isinstance(singular[0][1], CommonModeFilter):
-            text = "modes are an array, which serves for one CommonModeFilter alone"
-            raise InputError(text, place=place, cure=missing)
+        only = singular[0][1] if len(singular) == 1 else None
+        if not isinstance(only, CommonModeFilter) or only.group == "wafer" or only.method == "mean":
+            text = "an array of modes serves for one CommonModeFilter alone, with method: svd and"
+            raise InputError(f"{text} without group: wafer", place=place, cure=missing)
         if array.ndim != 2 or array.shape[1] != observation.n_detectors:
             text = f"modes of shape {array.shape} for {observation.n_detectors} detectors"
             raise InputError(text, place=place, cure="give U (k, n_det)")
@@ -269,7 +272,8 @@ def filters(pipeline: Steps, observation: Observation, modes: Any = None) -> Fil
 
 def modes(pipeline: Steps, observation: Observation, stream: Floats) -> dict[str, Any]:
     """What singular filters of a pipeline find in a stream (n_det, n_samp), K_RJ: by label, what
-    `filters` takes as ``modes``. Those before act on the stream as they do in a run.
+    `filters` takes as ``modes``. Those before act on the stream as they do in a run. Detectors that
+    they find dead have no part in the modes; the scan itself is not flagged.
     """
     return Filters(pipeline, observation, {}).found(stream)
 
