@@ -2,6 +2,7 @@
 signal-to-noise ratio of the true source, CPU time of a reading and of an iteration.
 
     python benchmarks/map_makers.py m2                  # MUSTANG-2, two daisies of 8.6 min
+    python benchmarks/map_makers.py m2 --iterated 2 10  # and filter-and-bin, its map subtracted before
     python benchmarks/map_makers.py m2 --templates 6    # and of the cluster in noise, so many seeds
     python benchmarks/map_makers.py atlast              # AtLAST's reduced camera, a daisy of 20 s
     python benchmarks/map_makers.py survey              # constant-elevation scans, I, Q and U
@@ -16,6 +17,7 @@ import argparse
 import os
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,6 +33,7 @@ from scipy import ndimage  # noqa: E402
 import zonda  # noqa: E402
 from zonda.core.data import Data  # noqa: E402
 from zonda.core.maps.noise_figures import matched  # noqa: E402
+from zonda.core.numerics.projection import directions  # noqa: E402
 from zonda.operators.maps import maximum_likelihood as ml  # noqa: E402
 from zonda.operators.maps.grid import Looking  # noqa: E402
 
@@ -95,6 +98,34 @@ def run(scene: zonda.Scene, steps: list[Any], full: bool = False, signals: Any =
         return zonda.Pipeline(steps, runs=runs).run(scene, threads=1)
 
 
+def iterated(kind: str, seed: int, number: int) -> tuple[Any, Any]:
+    """Maps of the sky and of the rest: ``number`` times the map is subtracted from the streams, and
+    what filters leave of the difference is added to it.
+    """
+    scene, steps, how, filters = pipeline(kind, seed)
+    kept = zonda.Pipeline(steps, runs={"sky": {**SIGNALS["sky"], "modes": "full"}}).run(
+        scene, threads=1, keep=["signal", "signal/sky"]
+    )
+    maps: dict[str, Any] = {}
+    pixels: dict[str, Any] = {}
+
+    def less_the_map(block: Any) -> None:
+        m = np.append(np.nan_to_num(maps[block.suffix]), 0.0)
+        at = pixels[block.observation.name][block.detectors, block.samples]
+        block.detdata["signal"] -= m[at]
+
+    again = zonda.operator(less_the_map, linear=True)
+    for _ in range(number):
+        first = [again] if maps else []
+        made = zonda.map(kept, [*first, *filters, zonda.BinMap(**how)], threads=1)
+        for suffix, name in (("", "map"), ("/sky", "sky/map")):
+            maps[suffix] = maps.get(suffix, 0.0) + made[name].signal
+        for scan in () if pixels else kept.observations:
+            places = directions(scan.boresight_radec, scan.focalplane.xi, scan.focalplane.eta)
+            pixels[scan.name] = made["map"].grid.pixels_at(places).astype(np.int32)
+    return maps["/sky"], maps[""] - maps["/sky"]
+
+
 class Rings:
     """Window of the hits (smooth, zero where thin) and rings between angular ``scales``, arcsec."""
 
@@ -135,20 +166,20 @@ class Rings:
         return ndimage.gaussian_filter(self.flat(m) * h, s) / np.maximum(total, 1e-3 * h.max())
 
 
-def compare(kind: str, seed: int) -> None:
+def compare(kind: str, seed: int, again: Sequence[int]) -> None:
     scene, steps, how, filters = pipeline(kind, seed)
     truth = run(scene, [*steps, zonda.BinMap(**how)], signals={"sky": SIGNALS["sky"]})["sky/map"]
     binned = run(scene, [*steps, *filters, zonda.BinMap(**how)], full=True)
     start = time.process_time()
     likely = run(scene, [*steps, Maker(**how)])
     seconds = time.process_time() - start
-    maps = KEPT[0]
+    solved = KEPT[0]
     rings, beam = Rings(truth, SCALES[kind]), BEAM[kind]
     core = rings.w > 0.9
     true = rings.smooth(truth.signal, truth, beam)
     at = np.unravel_index(np.argmin(np.where(core, true, 0)), true.shape)
     samples = int(truth.hits.sum())
-    equations, solution, cpu = maps["signal"]
+    equations, solution, cpu = solved["signal"]
     runs = sum(scan.pixel.size for scan, _ in equations.scans) / samples
     print(f"{samples:.3g} samples, {runs:.2f} runs a sample, {seconds:.1f} CPU s in all")
     print(
@@ -157,17 +188,22 @@ def compare(kind: str, seed: int) -> None:
         f" smallest Ritz value {solution.ritz[0]:.1e}"
     )
     print("scale [arcsec]     ", *(f"{s:6.0f}" for s in rings.scale))
-    noises = {}
-    for name, data in (("filter and bin", binned), ("maximum likelihood", likely)):
-        transfer = rings.transfer(data["sky/map"].signal, truth.signal)
-        noises[name] = rings.smooth(data["rest/map"].signal, truth, beam)[core].std()
-        peak = rings.smooth(data["sky/map"].signal, truth, beam)[at] / true[at]
-        print(f"{name:19s}", *(f"{t:6.3f}" for t in transfer), f" peak {peak:.3f}")
-    one, other = noises.values()
-    print(
-        f"noise of the map smoothed with {beam} arcsec: {one * 1e6:.0f}, {other * 1e6:.0f} uK,"
-        f" {other / one:.3f} times"
-    )
+    maps = {
+        name: (data["sky/map"].signal, data["rest/map"].signal)
+        for name, data in (("filter and bin", binned), ("maximum likelihood", likely))
+    }
+    maps |= {f"iterated {number} times": iterated(kind, seed, number) for number in again}
+    first = 0.0
+    for name, (sky, rest) in maps.items():
+        transfer = rings.transfer(sky, truth.signal)
+        noise = rings.smooth(rest, truth, beam)[core].std()
+        first = first or noise
+        peak = rings.smooth(sky, truth, beam)[at] / true[at]
+        print(
+            f"{name:19s}",
+            *(f"{t:6.3f}" for t in transfer),
+            f" peak {peak:.3f}, noise in {beam} arcsec {noise * 1e6:.0f} uK, {noise / first:.3f}",
+        )
 
 
 PLACES = ((0, 0), (30, 30), (-30, 30), (30, -30))
@@ -377,13 +413,14 @@ def main() -> None:
     parser.add_argument("kind", choices=["m2", "atlast", "survey"])
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--templates", type=int, default=0, metavar="SEEDS")
+    parser.add_argument("--iterated", type=int, nargs="*", default=[], metavar="TIMES")
     options = parser.parse_args()
     if options.templates:
         templates([options.seed + k for k in range(options.templates)])
     elif options.kind == "survey":
         survey(options.seed)
     else:
-        compare(options.kind, options.seed)
+        compare(options.kind, options.seed, options.iterated)
 
 
 if __name__ == "__main__":
