@@ -4,19 +4,21 @@ functions).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import PrivateAttr
 
 from .errors import OutputError
 from .operator import Operator
 from .signal import Signal
-from .storage.files import check_output_folder
+from .storage.files import check_output_folder, product_path
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from .data import Data, Observation
+    from .storage.table_files import Column
 
 Progress = Literal["pointing", "scan", "maps"]
 
@@ -102,3 +104,29 @@ def output_folder(of: Data | Observation, place: str) -> Path:
             cure="give one: zonda run --output FOLDER, or run(scene, output=...)",
         )
     return check_output_folder(of.output)
+
+
+def about(data: Data, **more: Any) -> dict[str, Any]:
+    """Provenance of a table: pipeline, seed, version, and ``more``; without what is empty."""
+    known = data.provenance
+    meta = {
+        "PIPELINE": known.get("name"),
+        "SEED": data.scene.seed,
+        "ZONDA": known.get("versions", {}).get("zonda"),
+        **more,
+    }
+    return {key: value for key, value in meta.items() if value not in ("", None)}
+
+
+def publish(
+    data: Data, key: str, product: Any, tables: Mapping[str, Sequence[Column]], **more: Any
+) -> None:
+    """Make a product, and where there is an output folder write its ``tables``, by what stands
+    behind its name; ``more``: beside their provenance.
+    """
+    data.products[key] = product
+    for behind, columns in tables.items() if data.output is not None else ():
+        from .storage.table_files import write_ecsv
+
+        path = product_path(data.output, data.named(f"{key}{behind}"), ".ecsv")
+        write_ecsv(path, columns, about(data, **more))

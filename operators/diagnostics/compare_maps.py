@@ -20,7 +20,7 @@ from zonda.core.maps.noise_figures import Noise, is_quiet, maps_of, matched, noi
 from zonda.core.maps.smoothing import smoother
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.sphere import beam_area
-from zonda.core.output import Output
+from zonda.core.output import Output, about
 from zonda.core.storage.files import product_path
 
 from .comparison.files import (
@@ -34,7 +34,7 @@ from .comparison.files import (
 )
 from .comparison.planes import EMPTY, NOT_EMPTY, Plane
 from .comparison.statistics import THRESHOLD, Comparison, compare
-from .series import about, check_map, key_of, plane_key
+from .series import check_map, key_of, plane_key
 from .transfer_function import window_of
 
 if TYPE_CHECKING:

@@ -28,12 +28,12 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import maps_of, noise_sources
 from zonda.core.numerics.projection import frame_rotation, pixel_matrix
 from zonda.core.numerics.sphere import FWHM_PER_SIGMA, local_axes
-from zonda.core.output import Output
+from zonda.core.output import Output, publish
 from zonda.core.polarization import between_meridians, turned_by
 from zonda.core.types import Floats
 
 from .comparison.radial import RadialSpectra, radial_spectra, ring_edges
-from .series import check_map, key_of, kinds_of_maps, publish
+from .series import check_map, key_of, kinds_of_maps
 from .transfer_function import window_of
 
 LARGEST_NSIDE = 2048

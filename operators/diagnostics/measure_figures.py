@@ -11,11 +11,11 @@ from pydantic import Field, model_validator
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.figures import Choice, Figure, FigureMetric, Figures
-from zonda.core.output import Output
+from zonda.core.output import Output, about
 from zonda.core.signal import Signal
 from zonda.core.storage.files import product_path
 
-from .series import about, key_of, kinds_of_maps
+from .series import key_of, kinds_of_maps
 
 
 class MeasureFigures(Output):

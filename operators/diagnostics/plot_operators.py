@@ -331,6 +331,7 @@ DRAWN = frozenset(
         "modes",
         "comparison",
         "map_spectra",
+        "noise_model",
         "screens",
         "stream_comparison",
     ]
@@ -346,7 +347,7 @@ class Plots(MapOutput):
 
     ``input.png``, ``noiseless_map.png``, ``map.png``, ``noise_map.png``, ``coverage.png``,
     ``power_spectra.png``, ``tod.png``, ``scan.png``, ``transfer_function.png``, ``modes.png``,
-    ``comparison.png``, ``map_spectra.png``. The report shows them too.
+    ``comparison.png``, ``map_spectra.png``, ``noise_model.png``. The report shows them too.
 
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """

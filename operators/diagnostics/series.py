@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -17,10 +17,10 @@ from pydantic import Field
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
+from zonda.core.output import publish
 from zonda.core.product import Record
 from zonda.core.signal import is_stream
-from zonda.core.storage.files import product_path
-from zonda.core.storage.table_files import Column, write_ecsv
+from zonda.core.storage.table_files import Column
 from zonda.core.stream import StreamName, streams_asked, streams_needed
 from zonda.core.tables import html_table
 from zonda.core.types import Floats
@@ -278,30 +278,6 @@ class TimeStream(Series):
     names: list[str]
     observation: str
     label: str
-
-
-def about(data: Data, **more: Any) -> dict[str, Any]:
-    """Provenance of a table: pipeline, seed, version, and ``more``; without what is empty."""
-    known = data.provenance
-    meta = {
-        "PIPELINE": known.get("name"),
-        "SEED": data.scene.seed,
-        "ZONDA": known.get("versions", {}).get("zonda"),
-        **more,
-    }
-    return {key: value for key, value in meta.items() if value not in ("", None)}
-
-
-def publish(
-    data: Data, key: str, product: Any, tables: Mapping[str, Sequence[Column]], **more: Any
-) -> None:
-    """Make a product, and where there is an output folder write its ``tables``, by what stands
-    behind its name; ``more``: beside their provenance.
-    """
-    data.products[key] = product
-    for behind, columns in tables.items() if data.output is not None else ():
-        path = product_path(data.output, data.named(f"{key}{behind}"), ".ecsv")
-        write_ecsv(path, columns, about(data, **more))
 
 
 def key_of(operator: Operator, usual: str) -> str:

@@ -34,14 +34,14 @@ from zonda.core.data import Data
 from zonda.core.errors import PipelineError
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.sphere import ARCSEC, FWHM_PER_SIGMA
-from zonda.core.output import Output
+from zonda.core.output import Output, publish
 from zonda.core.signal import Signal, product_name, stream_of
 from zonda.core.storage.table_files import Column
 from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
 from .comparison.radial import Rings, correlation, scale_of, tapered
-from .series import check_map, key_of, kinds_of_maps, plane_key, publish
+from .series import check_map, key_of, kinds_of_maps, plane_key
 
 NOT_TAN, CURE = (
     "a transfer function needs a TAN map of the signal",

@@ -14,6 +14,8 @@ import numpy as np
 
 from zonda.core.data import Data
 from zonda.core.maps.map_product import MapProduct
+from zonda.core.maps.planes import Plane
+from zonda.core.output import publish
 from zonda.core.signal import MAIN, Signal
 from zonda.core.types import Floats
 
@@ -21,15 +23,20 @@ from .baseline_noise import estimate
 from .intensity_kernel import VALUE
 from .likelihood_parameters import LikelihoodParameters
 from .map_from_sums import MapFromSums
+from .noise_record import NoiseRecord
 from .normal_equations import (
     CompressedScans,
     NormalEquations,
     Solution,
     WeighedScan,
 )
+from .preconditioner import UNDETERMINED
+from .undetermined import undetermined
 
 MOST_ITERATIONS = 1000
 """Of conjugate gradients."""
+POOR = 1e-2
+"""Ritz value of a pattern whose noise is ten times white noise."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,57 @@ class LikelihoodMaps(MapFromSums):
                 [one.data[stream] for one in self.scans.scans],
             )
             self._tell(solution, made.chi2)
+            self._publish(solution, made.chi2)
+            made = self._with_patterns(made)
         return made
+
+    def _publish(self, solution: Solution, chi2: tuple[float, float]) -> None:
+        """Make the product `NoiseRecord`, and write its tables."""
+        record = NoiseRecord(
+            list(self.sums.scans),
+            [noise for _, noise in self.equations.scans],
+            solution.history,
+            solution.ritz,
+            solution.before,
+            chi2,
+            self.parameters.tolerance,
+            self.parameters.label,
+        )
+        product = self.parameters.product
+        key = "noise_model" if product == "map" else f"noise_model_{product}"
+        publish(self.data, key, record, record.tables(), CHI2=chi2[0])
+
+    def _with_patterns(self, product: MapProduct) -> MapProduct:
+        """The product with planes of the patterns that the data hardly determine, if asked for."""
+        number, told = self.parameters.patterns, []
+        if not number:
+            return product
+        found, planes = undetermined(self.equations, number), dict(product.planes)
+        for k, (value, pattern) in enumerate(zip(*found, strict=True), 1):
+            determined = value > UNDETERMINED
+            told.append(f"{value:.1e}" if determined else f"< {UNDETERMINED:g}")
+            title = f"Pattern {k}, Ritz value {told[-1]}"
+            caption = "A pattern that the data do not determine, up to a factor."
+            if determined:
+                caption = (
+                    "A pattern of the map, up to a factor: the noise along it is"
+                    f" {value**-0.5:.2g} times that of white noise."
+                )
+            most = int(np.abs(pattern).max(axis=1).argmax())
+            for j, row in enumerate(self._rows(product, pattern)):
+                key = f"undetermined_{k}{('', '_q', '_u')[j]}"
+                colours = (-1.0, 1.0) if j == most else None
+                planes[key] = Plane(
+                    row[None],
+                    {key: title},
+                    unit="share of the largest value",
+                    colours=colours,
+                    title=title,
+                    caption=caption,
+                )
+        label = self.parameters.label
+        self.data.log.state(label, "Ritz values of patterns in the map", ", ".join(told))
+        return replace(product, planes=planes)
 
     def _with_values(self, product: MapProduct, values: Floats, stream: str) -> MapProduct:
         """The product of a signal with these values, (n_stokes, n_pixels), and its weights as a
@@ -186,7 +243,8 @@ class LikelihoodMaps(MapFromSums):
         if solution.history:
             least = min(solution.history)
             log.state(label, "residual over right side", f"{least:.1e}")
-            log.state(label, "smallest Ritz value", f"{solution.ritz[0]:.1e}")
+            where = "" if step.patterns or solution.ritz[0] > POOR else "; patterns: 3 shows where"
+            log.state(label, "smallest Ritz value", f"{solution.ritz[0]:.1e}{where}")
             if solution.smooth:
                 found = f"{len(solution.smooth.rows)}, after {solution.before} iterations"
                 log.state(label, "smooth patterns of the preconditioner", found)

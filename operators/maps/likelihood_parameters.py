@@ -44,6 +44,10 @@ class LikelihoodParameters(MapParameters):
             raise ValueError(f"{value} belongs to BinMap; write estimated or simulated")
         return value
 
+    patterns: int = Field(0, ge=0, le=10)
+    """How many of the patterns that the data determine least are found and become planes of the
+    map, with their pictures. Finding them may take as long as the map, or several times as long."""
+
     @model_validator(mode="after")
     def _of_likelihood(self) -> LikelihoodParameters:
         if self.free > self.modes:

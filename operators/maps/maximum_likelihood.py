@@ -55,6 +55,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
     weighed down by their spectra, equation (1), and no scale is filtered away.
     """
 
+    provides: ClassVar[frozenset[str]] = frozenset({"map", "noise_model"})
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
     all_bands: ClassVar[bool] = False
     linear: ClassVar[bool] = False

@@ -162,18 +162,18 @@ class NormalEquations:
         self.weights = np.zeros((1 if self.n_stokes == 1 else 6, self.n_pixels))
         for scan, noise in self.scans:
             scan.weigh(1 / noise.white, self.weights)
-        self._inverse = inverse_of(self.weights)
+        self.inverse = inverse_of(self.weights)
 
     @property
     def spread(self) -> Floats:
         """(n_stokes, n_pixels) diagonal of the inverse weights; 0 without samples."""
-        return self._inverse if self.n_stokes == 1 else self._inverse[[0, 3, 5]]
+        return self.inverse if self.n_stokes == 1 else self.inverse[[0, 3, 5]]
 
     @property
     def rank(self) -> float:
         """Number of values of a map that the weights of pixels determine."""
         places = [0] if self.n_stokes == 1 else list(PLACES)
-        return float((self._inverse[places] * self.weights[places]).sum())
+        return float((self.inverse[places] * self.weights[places]).sum())
 
     def chi_square(
         self, m: Floats, right: Floats, data: Sequence[tuple[Floats, Floats]]
@@ -185,7 +185,7 @@ class NormalEquations:
         square = math.fsum(scan.square(*one) for scan, one in zip(self.scans, data, strict=True))
         square += float((m * (self.apply(m) - 2 * right)).sum())
         freedom = sum(scan.freedom for scan in self.scans) - self.rank
-        return square / freedom, math.sqrt(2 / freedom)
+        return float(square / freedom), math.sqrt(2 / freedom)
 
     def right_side(self, binned: Floats, data: Sequence[tuple[Floats, Floats]]) -> Floats:
         """The right side: ``binned`` P^T d / sigma^2, and y and s of the data of each scan."""
@@ -200,7 +200,7 @@ class NormalEquations:
         Behind it, and along patterns that the data do not determine, there is rounding alone.
         """
         m, r, smooth, before = np.zeros_like(right), right.copy(), None, 0
-        z = times(self._inverse, r)
+        z = times(self.inverse, r)
         p, product = z.copy(), float((r * z).sum())
         first, history, ritz = product, list[float](), list[Floats]()
         steps, turns, best, size = list[float](), list[float](), m, product
@@ -218,7 +218,7 @@ class NormalEquations:
             step = product / curvature
             m += step * p
             r -= step * q
-            z = times(self._inverse, r)
+            z = times(self.inverse, r)
             if smooth:
                 z[0] += smooth.correct(r[0])
             product, last = float((r * z).sum()), product

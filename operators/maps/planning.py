@@ -124,14 +124,17 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
 
     def finished(self, observation: Observation) -> tuple[int, int]:
         """Maps of conjugate gradients and of smooth patterns, and weights with their inverse; of a
-        half difference those of the whole and of one half, too. Each thread has baselines and maps
-        of a scan.
+        half difference those of the whole and of one half, too; of patterns two blocks of three.
+        Each thread has baselines and maps of a scan.
         """
         most, product = super().finished(observation)
         stokes, weights = (3, 12) if self.polarized else (1, 2)
         halves = 2 * (stokes + weights) * bool(self.operator.half_difference)
         at_once, free = self.operator._at_once, self.operator.free
-        maps = (15 + 3 * at_once) * stokes + weights + 6 + halves
+        step = self.operator
+        block = (max(step.patterns, 3 * stokes) + 1) * bool(step.patterns)
+        maps = (15 + 3 * at_once + 14 * block) * stokes + weights + 6 + halves
+        product += 8 * stokes * (1 + step.patterns) * self.pixels
         scan = int(50 * self.baselines(observation)) + 32 * free * observation.n_samples
         return most + 8 * maps * self.pixels + at_once * scan, product + COMPILED
 

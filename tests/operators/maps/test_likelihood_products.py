@@ -1,10 +1,11 @@
-"""Products of maximum-likelihood maps: the source as a template, chi^2."""
+"""Products of maximum-likelihood maps: the source as a template, chi^2, noise model."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import Table
 
 import zonda
 import zonda.pipelines
@@ -53,6 +54,8 @@ def found(tmp_path_factory):
         ),
         zonda.BinMap(pixel="4 arcsec", product="binned"),
         zonda.SaveMap(),
+        zonda.Plots(),
+        zonda.Report(),
     ]
     folder = tmp_path_factory.mktemp("run")
     return zonda.Pipeline(steps, runs=RUNS).run(zonda.Scene(**SCENE), threads=1, output=folder)
@@ -109,6 +112,39 @@ def test_chi_square_of_wrong_models(scanned):
     ):
         value, error = chi2(o, signal + noise, **how)
         assert value > 1 + 10 * error, how
+
+
+def test_the_noise_model_is_a_product(found):
+    record = found["noise_model"]
+    (model,) = record.models
+    assert record.scans == [o.name for o in found.observations]
+    # white noise: that of the detectors, and baselines like it
+    net = found.observations[0].focalplane.net
+    assert np.sqrt(model.white.mean()) == pytest.approx(net.mean() * np.sqrt(50), rel=0.03)
+    # 40 detectors' powers in bins of 10 frequencies or more scatter by 5 %; below 1 they are 1
+    many = np.diff(model.edges) >= 10
+    assert (model.own[many] < 1.2).all()
+    assert record.chi2 == found["map"].chi2
+    assert record.history[-1] < 1e-6 <= record.history[-2]
+    assert 0 < record.ritz[0] < record.ritz[-1] < 1.001
+
+
+def test_the_noise_model_has_files_and_pictures(found):
+    record, folder = found["noise_model"], found.output
+    table = Table.read(folder / "noise_model.ecsv")
+    np.testing.assert_allclose(table["own"], record.models[0].own, rtol=1e-8)
+    assert table["frequency"].unit == "Hz"
+    steps = Table.read(folder / "noise_model_convergence.ecsv")
+    np.testing.assert_allclose(steps["residual"], record.history, rtol=1e-8)
+    assert Table.read(folder / "noise_model_modes.ecsv").colnames == ["scan", "white", "free"]
+    assert len(Table.read(folder / "noise_model_ritz.ecsv")) == len(record.ritz)
+    report = (folder / "report.html").read_text()
+    for title in ("Noise model", "Convergence of the map"):
+        assert f"<b>{title}.</b>" in report
+    assert (folder / "noise_model.png").exists()
+    assert (folder / "noise_model_convergence.png").exists()
+    for text in ("chi^2 per sample", "taken off the map of I", "its weighted plane"):
+        assert text in report
 
 
 def test_a_template_in_white_noise(found):

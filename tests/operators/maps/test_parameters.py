@@ -64,6 +64,7 @@ STEPS = (
             "refine": ({}, {"refine": 0}),
             "tolerance": ({}, {"tolerance": 1e-2}),
             "undetermined": ({}, {"undetermined": "none"}),
+            "patterns": ({}, {"patterns": 2}),
         },
         refused=dict.fromkeys(("weights", "contents"), "belong to BinMap"),
         polarized=("condition_limit", "stokes"),
