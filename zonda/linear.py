@@ -19,7 +19,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator
+from scipy.sparse.linalg import LinearOperator, cg
 
 from zonda.core.assembly import arguments
 from zonda.core.block import Block
@@ -46,6 +46,7 @@ from zonda.operators.maps.map_from_sums import TRIANGLE
 from zonda.operators.maps.map_layout import MapLayout
 from zonda.operators.maps.maximum_likelihood import MaximumLikelihoodMap
 from zonda.operators.maps.normal_equations import (
+    EXACT,
     NormalEquations,
     WeighedScan,
     inverse_of,
@@ -359,7 +360,7 @@ def compressed(
     step = _Unsolved.model_construct(maker.model_fields_set, **own)
     of_band(data, band, "zonda.linear.compressed")
     made: LikelihoodMaps = map_streams(data, [step])[f"equations_{band}" if band else "equations"]
-    right = made.right_side(made.equations, MAIN)
+    right = made.equations.eliminated(made.right_side(made.equations, MAIN))
     scans, noise = zip(*made.equations.scans, strict=True)
     return list(scans), list(noise), right.ravel()
 
@@ -368,7 +369,8 @@ def noise_weight(
     scan: CompressedScan, noise: BaselineNoise, observation: Observation | None = None
 ) -> LinearOperator:
     """Q of equation (4), symmetric: the inverse covariance of a scan's noise, with polynomials and
-    free modes of infinite variance. Of streams of the good detectors, (n_good n_samp)^2; given the
+    free modes of infinite variance, and samples that do not count too. Of streams of the good
+    detectors, (n_good n_samp)^2; given the
     ``observation``, of all its detectors, of which the others weigh nothing.
 
     ``scan`` and ``noise`` are those of `compressed`. Raises InputError where the observation is
@@ -383,7 +385,8 @@ def noise_weight(
         text = f"the scan has {n_good} detectors and {scan.n_samples} samples"
         cure = "give the observation that was compressed"
         raise InputError(text, place="zonda.linear.noise_weight", cure=cure)
-    counts = np.repeat(scan.pixel < scan.n_pixels, scan.samples).reshape(n_good, -1)
+    pixel = np.repeat(scan.pixel, scan.samples).reshape(n_good, -1)
+    counts, gaps = pixel < scan.width, (pixel >= scan.n_pixels) & (pixel < scan.width)
     starts, a = np.arange(n_base) * scan.length, noise.free_modes
     of = np.repeat(np.arange(n_base), scan.length)[: scan.n_samples]
 
@@ -396,7 +399,8 @@ def noise_weight(
         """Samples that count about the means of their baselines; 0 for others."""
         return np.where(counts[some], x - means(x, some)[:, of], 0.0)
 
-    def weigh(d: Floats) -> Floats:
+    def whole(d: Floats) -> Floats:
+        """Q of all samples, gaps too."""
         d, out = d.reshape(n_det, -1), np.zeros((n_det, scan.n_samples))
         y, s = np.empty(scan.shape), np.zeros((len(a), scan.n_samples))
         parts = chunks(n_good, TILE_DETECTORS)
@@ -411,6 +415,29 @@ def noise_weight(
         return out.ravel()
 
     size = n_det * scan.n_samples
+    every = np.zeros((n_det, scan.n_samples), np.bool_)
+    every[rows] = gaps
+    lacking = np.flatnonzero(every)
+    variance = np.repeat(noise.white, gaps.sum(axis=1))
+
+    def weigh(d: Floats) -> Floats:
+        """Q of samples that count: gaps have the values that make the product 0 there."""
+        x = np.where(every, 0.0, d.reshape(n_det, -1)).ravel()
+        out = whole(x)
+        if lacking.size:
+            unit = np.zeros(size)
+
+            def of_gaps(values: Floats) -> Floats:
+                unit[lacking] = values
+                return whole(unit)[lacking]
+
+            shape = (lacking.size, lacking.size)
+            left = LinearOperator(shape, matvec=of_gaps, dtype=np.float64)
+            inverse = LinearOperator(shape, matvec=lambda r: r.ravel() * variance, dtype=np.float64)
+            x[lacking] = cg(left, -out[lacking], rtol=EXACT, M=inverse)[0]
+            out = np.where(every.ravel(), 0.0, whole(x))
+        return out
+
     return LinearOperator((size, size), matvec=weigh, rmatvec=weigh, dtype=np.float64)
 
 

@@ -38,6 +38,8 @@ SLOW = 1.0
 """Modes are those of baselines below this frequency, Hz."""
 FEWEST = 8
 """Frequencies that modes are found in at least."""
+FILLS = 40
+"""Steps of the fit that fills baselines: what is left falls by the share of them that lack."""
 ITERATIONS = 40
 """Products with the covariance in the search for its leading modes."""
 
@@ -119,6 +121,7 @@ def estimate(
     free: int,
     trend: int,
     fixed: Floats | None = None,
+    lacking: NDArray[np.bool_] | None = None,
 ) -> BaselineNoise:
     """Estimate the noise from baselines without a source, (n_det, n_base) [K].
 
@@ -136,6 +139,8 @@ def estimate(
         Degree of the polynomials of each detector's scan.
     fixed
         (free, n_det) the free modes, where they are known.
+    lacking
+        (n_det, n_base) baselines that were `filled`: they have no noise of their own.
     """
     n_det, n_base = residual.shape
     seen_of_each = np.count_nonzero(counted, axis=1)[:, None]
@@ -143,6 +148,9 @@ def estimate(
     scaled = residual / np.sqrt(white / length)[:, None]
     take_lines(scaled, lines, counted)
     powers = fft.rfft(scaled, axis=1) / np.sqrt(np.maximum(seen_of_each, 1))
+    has = np.ones(n_det)
+    if lacking is not None:
+        has -= np.count_nonzero(lacking, axis=1) / np.maximum(seen_of_each[:, 0], 1)
     top = min(max(int(SLOW * length / rate * n_base), FEWEST), powers.shape[1])
     slow = np.concatenate([powers[:, 1:top].real, powers[:, 1:top].imag], axis=1)
     n_seen = int(np.count_nonzero(seen_of_each))
@@ -154,17 +162,20 @@ def estimate(
     edges = bins_of(powers.shape[1])
     own, least = np.empty((2, len(edges) - 1))
     shared = np.empty((len(edges) - 1, modes))
+    own_share = float(has[seen_of_each[:, 0] > 0].mean()) if n_seen else 1.0
     amplitude = np.abs(_projected(powers, found)) ** 2
     every = np.einsum("dt,dt->t", powers.real, powers.real)
     every += np.einsum("dt,dt->t", powers.imag, powers.imag)
     for k, (low, high) in enumerate(pairwise(edges.tolist())):
         at = slice(max(low, 1), max(high, 2))
-        rest = (every[at] - amplitude[:, at].sum(axis=0)).mean() / max(n_seen - modes, 1)
+        rest = (
+            (every[at] - amplitude[:, at].sum(axis=0)).mean() / max(n_seen - modes, 1) / own_share
+        )
         least[k], own[k] = rest, max(rest, 1.0)
         shared[k] = np.maximum(amplitude[:, at].mean(axis=1) - own[k], 0.0)
     upper = powers[:, powers.shape[1] // 2 :]
     rest_of_each = upper - np.einsum("kd,kt->dt", found, _projected(upper, found))
-    left = np.maximum(1 - (found**2).sum(axis=0), 0.1)  # of its white noise, without the modes
+    left = np.maximum(has - (found**2).sum(axis=0), 0.1)  # of its white noise, without the modes
     fast = np.where(seen_of_each[:, 0], (np.abs(rest_of_each) ** 2).mean(axis=1) / left, 1.0)
     share = max(seen_of_each.max(), 1) / n_base
     middle = (edges[:-1] + edges[1:] - 1) / 2 / n_base * rate / length
@@ -184,6 +195,25 @@ def estimate(
         np.where(edges[:-1] < (1 + LOWEST) / share, 0, 2 * np.diff(edges) * share)
         * max(n_seen - modes, 1),
     )
+
+
+def filled(
+    y: Floats, lacking: NDArray[np.bool_], white: Floats, mode: Floats, trend: int
+) -> Floats:
+    """Baselines (n_det, n_base) [K]; those that are ``lacking`` (n_det, n_base) are what the others
+    at that time see of a mode (n_det,), and a polynomial of the detector. Linear in y.
+    """
+    if not lacking.any():
+        return y
+    g, lines = np.sqrt(white)[:, None], polynomials(y.shape[1], trend)
+    z, own = np.where(lacking, 0.0, y / g), np.zeros(y.shape)
+    weights = np.where(lacking, 0.0, mode[:, None])
+    weights /= np.maximum((weights * mode[:, None]).sum(axis=0), 1e-300)
+    for _ in range(FILLS):
+        common = mode[:, None] * ((z - own) * weights).sum(axis=0)
+        rest = np.where(lacking, own, z - common)
+        own = np.einsum("dp,pt->dt", np.einsum("dt,pt->dp", rest, lines), lines)
+    return np.where(lacking, (own + common) * g, y)
 
 
 def _projected(powers: NDArray[np.complex128], modes: Floats) -> NDArray[np.complex128]:

@@ -10,7 +10,12 @@ those that count (not flagged, finite, inside the map) a scan keeps
 and the *runs*: successive samples of one detector in one pixel p, n at a time. A run adds n m_p to
 its baseline, and a step up at its first sample and down behind its last to s; the adjoint takes
 differences of running sums of s. Of a map, (1) and (2) therefore cost a few operations for each
-run, not for each sample. Samples that do not count lie in one further pixel, and add nothing.
+run, not for each sample.
+
+A sample that does not count while those of other detectors do is a *gap*: a run in a pixel of its
+own beyond the map, of I alone, and so an unknown of infinite variance. Streams have the mean of
+their baseline there. Samples of instants that no detector has, and of detectors that have none,
+lie in one further pixel, and add nothing.
 
 A polarized run sees v = I + c Q + s U with the means of c and s (`core.polarization`) over it;
 where the angle turns within a run (a half-wave plate), each sample is a run of its own.
@@ -38,15 +43,17 @@ class CompressedScan:
     ----------
     length, rate
         Samples of a baseline, and the sample rate [Hz].
-    n_pixels
-        Of the map; also the number of the pixel of samples that do not count.
+    n_pixels, gaps
+        Of the map; then pixels of gaps follow, then that of samples that are left out.
     pixel, samples
         (n_runs,) int32 and uint16: pixel of each run, and its samples; one detector after the
         other, in order of time.
     first
         (n_det n_base + 1,) int64: the first run of each baseline.
     counted
-        (n_det, n_base) int32: samples of each baseline that count.
+        (n_det, n_base) int32: samples of each baseline that count, and gaps.
+    known
+        (n_det, n_base) int32: those of them that are no gaps.
     angles
         (2, n_runs) means of c and s over each run; (2, 0) for maps of I.
     within
@@ -58,10 +65,12 @@ class CompressedScan:
     rate: float
     n_samples: int
     n_pixels: int
+    gaps: int
     pixel: NDArray[np.int32]
     samples: NDArray[np.uint16]
     first: NDArray[np.int64]
     counted: NDArray[np.int32]
+    known: NDArray[np.int32]
     angles: Floats = field(default_factory=lambda: np.zeros((2, 0)))
     within: Floats = field(default_factory=lambda: np.zeros(0))
 
@@ -71,13 +80,23 @@ class CompressedScan:
         return self.counted.shape[0], self.counted.shape[1]
 
     @property
+    def width(self) -> int:
+        """Pixels of the map, and gaps: columns of the maps below."""
+        return self.n_pixels + self.gaps
+
+    @property
+    def lacking(self) -> NDArray[np.bool_]:
+        """(n_det, n_base) baselines of gaps alone."""
+        return np.asarray((self.known == 0) & (self.counted > 0))
+
+    @property
     def nbytes(self) -> int:
         """Bytes that it holds."""
         every = self.pixel, self.samples, self.first, self.counted, self.angles
-        return sum(array.nbytes for array in every)
+        return sum(array.nbytes for array in every) + (self.known.nbytes if self.gaps else 0)
 
     def seen(self, m: Floats, a: Floats) -> tuple[Floats, Floats]:
-        """(Y m (n_det, n_base), S m (k, n_samp)) of a map m (1 or 3, n_pixels), equations (1) and
+        """(Y m (n_det, n_base), S m (k, n_samp)) of a map m (1 or 3, width), equations (1) and
         (2); ``a`` (k, n_det).
         """
         y, steps = np.empty(self.shape), np.zeros((len(a), self.n_samples + 1))
@@ -85,7 +104,7 @@ class CompressedScan:
         return y, np.cumsum(steps, axis=1)[:, :-1]
 
     def spread(self, y: Floats, s: Floats, a: Floats, out: Floats) -> None:
-        """Add Y^T y + S^T s to a map ``out`` (1 or 3, n_pixels): the adjoint of `seen`."""
+        """Add Y^T y + S^T s to a map ``out`` (1 or 3, width): the adjoint of `seen`."""
         running = np.zeros((len(a), self.n_samples + 1))
         np.cumsum(s, axis=1, out=running[:, 1:])
         _spread(*self._runs, a, np.ascontiguousarray(y), running, out)
@@ -98,9 +117,15 @@ class CompressedScan:
 
     def weigh(self, weight: Floats, out: Floats) -> None:
         """Add each detector's ``weight`` (n_det,) at its samples to the weights ``out`` (1 or 6,
-        n_pixels) of I, or of I, Q and U: ii, iq, iu, qq, qu, uu.
+        width) of I, or of I, Q and U: ii, iq, iu, qq, qu, uu.
         """
         _weigh(*self._runs, weight, out)
+
+    def in_gaps(self, y: Floats) -> Floats:
+        """(gaps,) of each gap its baseline's value of y (n_det, n_base)."""
+        out = np.empty(self.gaps)
+        _in_gaps(self.first, self.pixel, self.n_pixels, y, out)
+        return out
 
     @property
     def _runs(self) -> tuple[Any, ...]:
@@ -152,18 +177,20 @@ class RunsOfTiles:
                     angles[:, to] = tile.angles[:, of]
                 at[row] += number
                 begin += number
-        return CompressedScan(
-            self.length,
-            rate,
-            self.n_samples,
-            n_pixels,
-            pixel,
-            samples,
-            first,
-            self.counted,
-            angles,
-            self.about.sum(axis=1),
-        )
+        runs = first, pixel, samples, angles, self.counted, n_pixels
+        have = np.zeros(self.n_samples, np.bool_)
+        _have(*runs, have)
+        n_runs, gaps = _with_gaps(*runs, have, 0, pixel[:0], samples[:0], angles[:, :0], first[:0])
+        more, counted = first, self.counted
+        if gaps:
+            longer = np.empty(n_runs, np.int32), np.empty(n_runs, np.uint16)
+            wide, more = np.zeros((2, n_runs if polarized else 0)), np.zeros_like(first)
+            _with_gaps(*runs, have, n_pixels + gaps, *longer, wide, more)
+            (pixel, samples), angles, counted = longer, wide, self.counted.copy()
+            _count(more, pixel, samples, n_pixels + gaps, counted)
+        sizes = self.length, rate, self.n_samples, n_pixels, gaps
+        within = self.about.sum(axis=1)
+        return CompressedScan(*sizes, pixel, samples, more, counted, self.counted, angles, within)
 
     @property
     def about(self) -> Floats:
@@ -283,6 +310,83 @@ def _find(  # type: ignore[no-untyped-def]
             angles[0, r] /= size[r]
             angles[1, r] /= size[r]
     return k + 1
+
+
+@kernel
+def _have(first, pixel, samples, angles, counted, nowhere, have):  # type: ignore[no-untyped-def]
+    """Note instants at which a sample of some detector counts."""
+    n_det, n_base = counted.shape
+    for d in range(n_det):
+        t = 0
+        for r in range(first[d * n_base], first[(d + 1) * n_base]):
+            if pixel[r] < nowhere:
+                have[t : t + samples[r]] = True
+            t += samples[r]
+
+
+@kernel
+def _with_gaps(  # type: ignore[no-untyped-def]
+    first, pixel, samples, angles, counted, nowhere, have, left_out, new, size, wide, begins
+):
+    """Runs in which each gap has a run of its own, of which the pixels are ``nowhere`` and those
+    that follow; of what is left out ``left_out``. Returns the numbers of runs and of gaps; without
+    place for runs it counts them alone.
+    """
+    n_det, n_base = counted.shape
+    k, gaps, write = 0, 0, new.size > 0
+    for d in range(n_det):
+        t, some = 0, counted[d].sum() > 0
+        for b in range(n_base):
+            for r in range(first[d * n_base + b], first[d * n_base + b + 1]):
+                begin = t
+                t += samples[r]
+                while begin < t:
+                    end = t
+                    gap = pixel[r] >= nowhere and some and have[begin]
+                    if gap:
+                        end = begin + 1
+                    elif pixel[r] >= nowhere and some:
+                        end = begin + 1
+                        while end < t and not have[end]:
+                            end += 1
+                    if write:
+                        size[k] = end - begin
+                        new[k] = pixel[r]
+                        if gap:
+                            new[k] = nowhere + gaps
+                        elif pixel[r] >= nowhere:
+                            new[k] = left_out
+                        elif wide.shape[1]:
+                            wide[0, k], wide[1, k] = angles[0, r], angles[1, r]
+                    gaps += gap
+                    k += 1
+                    begin = end
+            if write:
+                begins[d * n_base + b + 1] = k
+    return k, gaps
+
+
+@kernel
+def _count(first, pixel, samples, left_out, counted):  # type: ignore[no-untyped-def]
+    """Count samples of baselines, gaps too."""
+    n_det, n_base = counted.shape
+    for d in range(n_det):
+        for b in range(n_base):
+            counted[d, b] = 0
+            for r in range(first[d * n_base + b], first[d * n_base + b + 1]):
+                if pixel[r] < left_out:
+                    counted[d, b] += samples[r]
+
+
+@kernel
+def _in_gaps(first, pixel, n_pixels, y, out):  # type: ignore[no-untyped-def]
+    """Values of baselines at gaps."""
+    n_det, n_base = y.shape
+    for d in range(n_det):
+        for b in range(n_base):
+            for r in range(first[d * n_base + b], first[d * n_base + b + 1]):
+                if n_pixels <= pixel[r] < n_pixels + out.size:
+                    out[pixel[r] - n_pixels] = y[d, b]
 
 
 @kernel(inline="always")

@@ -69,7 +69,7 @@ class LikelihoodMaps(MapFromSums):
         made = self._with_values(product, solution.values, stream)
         if stream == MAIN:
             made.chi2 = equations.chi_square(
-                solution.values,
+                solution,
                 self.right_side(equations, stream),
                 [one.data[stream] for one in self.scans.scans],
             )
@@ -146,10 +146,12 @@ class LikelihoodMaps(MapFromSums):
         found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
         step = self.parameters
         for _ in range(step.refine if step.noise != "simulated" else 0):
-            m = self._solved(found, self.sums.first).values
+            solution = self._solved(found, self.sums.first)
             scans = []
-            for one, (scan, noise) in zip(self.scans.scans, found.scans, strict=True):
-                y = one.data[self.sums.first][0] - scan.seen(m, np.zeros((0, len(noise.white))))[0]
+            for k, (one, (scan, noise)) in enumerate(
+                zip(self.scans.scans, found.scans, strict=True)
+            ):
+                y = one.data[self.sums.first][0] - found.baselines(solution, k)
                 new = estimate(
                     y,
                     scan.counted,
@@ -160,6 +162,7 @@ class LikelihoodMaps(MapFromSums):
                     free=step.free,
                     trend=step.trend,
                     fixed=noise.modes[: noise.free],
+                    lacking=scan.lacking,
                 )
                 if step.noise != "estimated":
                     new = replace(new, own=noise.own)  # that of a table
@@ -186,7 +189,7 @@ class LikelihoodMaps(MapFromSums):
     def right_side(
         self, equations: NormalEquations, stream: str, half: int | None = None
     ) -> Floats:
-        """P^T Q d of a signal (n_stokes, n_pixels), of all scans or of half of them."""
+        """P^T Q d of a signal, of all scans or of half of them: of map and gaps."""
         binned = self.sums.in_pixels(stream, slice(None), half).data.T / VALUE
         scans = self.scans.scans if half is None else self.scans.scans[half::2]
         data = [one.data[stream] for one in scans]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import warnings
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,10 +15,10 @@ from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.signal import MAIN
 from zonda.core.types import AnyFloats, Floats
 
-from .baseline_noise import BaselineNoise, estimate
+from .baseline_noise import BaselineNoise, estimate, filled
 from .bin_map import Prepared
 from .binning import Weights, binnings
-from .compressed_scan import CompressedScan, RunsOfTiles, Tile, add_baselines
+from .compressed_scan import RunsOfTiles, Tile, add_baselines
 from .intensity_kernel import VALUE, WEIGHT
 from .likelihood_parameters import LikelihoodParameters
 from .normal_equations import (
@@ -30,6 +29,9 @@ from .stated_noise import of_scene, of_table
 if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable
 
+FILLED, STILL = 60, 1e-6
+"""How often the mode that fills baselines is sought at most, and the change after which it stays.
+"""
 LOCK = threading.Lock()
 """Held while a thread adds to the sums of a scan."""
 
@@ -57,6 +59,8 @@ class LikelihoodScan:
     baselines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     common: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     found: Any = None
+    scan: Any = None
+    filler: Any = None
     noise: Any = None
 
     @property
@@ -120,12 +124,12 @@ class LikelihoodScan:
         for _, _, (rows, *made) in stream.sweep(tiles):
             for tile in made:
                 self.found.add(rows, tile)
+        self.scan = self.found.scan(observation.sample_rate, self.nowhere)
 
     def white(self, place: str) -> Floats:
         """(n,) variance of white noise; the median of the others for detectors without samples.
 
-        Raises PipelineError where there is none. Warns of detectors that lack samples which others
-        have.
+        Raises PipelineError where there is none.
         """
         observation, white = self.observation, np.asarray(self.found.scatter)
         place = f"{place}, {observation.name}"
@@ -138,30 +142,30 @@ class LikelihoodScan:
                 place=place,
                 cure="add WhiteNoise, or make the map with BinMap",
             )
-        number = self.found.counted.sum(axis=1)
-        less = (number > 0) & (number < 0.99 * number.max())
-        if less.any():
-            warnings.warn(
-                f"{place}: {int(less.sum())} detectors lack up to"
-                f" {100 * (1 - number[less].min() / number.max()):.2g} % of the samples that others"
-                " have: what detectors share stays in the map there; fill these gaps, or flag these"
-                " detectors",
-                stacklevel=4,
-            )
         return np.where(np.isnan(white), np.nanmedian(white), white)
 
     def estimate(self, white: Floats, step: LikelihoodParameters) -> BaselineNoise:
-        """Noise of the baselines, of white levels (n,) [K^2]."""
-        return estimate(
-            self.found.means,
-            self.found.counted,
-            white,
-            self.length,
-            self.observation.sample_rate,
-            modes=step.modes,
-            free=step.free,
-            trend=step.trend,
-        )
+        """Noise of the baselines, of white levels (n,) [K^2]. Baselines of gaps alone are filled by
+        what all see alike, then by the first mode that is found: a fit of more is not stable.
+        """
+        lacking, self.filler = self.scan.lacking, np.sqrt(1 / white / (1 / white).sum())
+        for _ in range(FILLED):
+            noise = estimate(
+                filled(self.found.means, lacking, white, self.filler, step.trend),
+                self.scan.counted,
+                white,
+                self.length,
+                self.observation.sample_rate,
+                modes=step.modes,
+                free=step.free,
+                trend=step.trend,
+                lacking=lacking,
+            )
+            before = self.filler
+            self.filler = noise.modes[0] if len(noise.modes) else before
+            if not lacking.any() or np.abs(self.filler - before).max() < STILL:
+                break
+        return noise
 
     def state_noise(self, step: LikelihoodParameters, table: NoiseTable | None) -> None:
         """Take the noise from a table, or from the scene.
@@ -208,8 +212,7 @@ class LikelihoodScan:
             polarized=first.angles is not None,
         )
         self.prepared = replace(self.prepared, halves=made)
-        scan: CompressedScan = self.found.scan(observation.sample_rate, self.nowhere)
-        self.found = scan
+        scan = self.scan
         for name in sorted({*observation.signals} - observation.unfiltered):
             self.baselines[name] = np.zeros(scan.shape, np.int64)
             self.common[name] = np.zeros(
@@ -247,9 +250,10 @@ class LikelihoodScan:
     def compressed(self) -> Compressed:
         """The scan without its observation."""
         data = {}
-        scan, a = self.found, self.noise.free_modes
+        scan, noise, a = self.scan, self.noise, self.noise.free_modes
         for name, sums in self.baselines.items():
-            y = sums / VALUE / np.maximum(scan.counted, 1)
+            y = sums / VALUE / np.maximum(scan.known, 1)
+            y = filled(y, scan.lacking, noise.white, self.filler, len(noise.lines) - 1)
             s = self.common[name] / (VALUE * self.scale)
             data[name] = (y, scan.about_means(s, y, a))
         return Compressed(scan, self.noise, data)

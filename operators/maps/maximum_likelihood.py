@@ -28,7 +28,6 @@ from .binning import Weights
 from .likelihood_maps import LikelihoodMaps
 from .likelihood_parameters import LikelihoodParameters
 from .likelihood_scan import LikelihoodScan
-from .map_layout import MapLayout
 from .map_sums import MapSums
 from .normal_equations import (
     CompressedScans,
@@ -42,8 +41,6 @@ LEAST_POWER, FREEDOM = 0.2, 40
 It is found from so many degrees of freedom at least: white noise has less once in 1e8."""
 SHORTEST = 16
 """Baselines of a scan."""
-MOST_OUTSIDE = 1e-3
-"""Share of the samples: what detectors share cannot be told where some of them see no pixel."""
 STEADY, WHITE_LEVELS = 0.75, 3
 """Where fast baselines have less than this share of the power that the scatter within them tells,
 modes that detectors share have a part in that scatter: what baselines tell is taken, and modes are
@@ -73,17 +70,13 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         self._at_once = min(data.threads, len(every))
 
     def check(self, data: Data) -> list[str]:
-        """See `BinMap.check`. Raises PipelineError for a width that leaves samples outside, and for
-        too few or too short baselines.
-        """
+        """See `BinMap.check`. Raises PipelineError for too few or too short baselines."""
         found = super().check(data)
         for observation in data.observations:
             self._length(observation)
             if self._table is not None:
                 names = np.array(observation.focalplane.names)[observation.good_detectors]
                 self._table.of(names.tolist(), f"{self.label}, {observation.name}")
-        if self.width is not None and data.observations:
-            self._need_all(MapLayout(self).outside(data.observations), self.label)
         return found
 
     @cached_property
@@ -114,20 +107,11 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
             )
         return length
 
-    def _need_all(self, outside: float, place: str) -> None:
-        if outside > MOST_OUTSIDE:
-            raise PipelineError(
-                f"{100 * outside:.2g} % of the samples are outside the map, and noise that"
-                " detectors share cannot be told there",
-                place=place,
-                cure="leave width out, or make the map with BinMap",
-            )
-
     def prepare(self, observation: Observation) -> LikelihoodScan:  # type: ignore[override]
         """Pixels and baselines of one observation, before its samples are read.
 
-        Raises PipelineError where a window has changed the samples, for samples outside the map,
-        and for too few or too short baselines.
+        Raises PipelineError where a window has changed the samples, and for too few or too short
+        baselines.
         """
         place = f"{self.label}, {observation.name}"
         length = self._length(observation)
@@ -137,7 +121,6 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
                 place=place,
                 cure="leave the window out: slow noise needs none here",
             )
-        self._need_all(MapLayout(self).outside([observation], self.grid), place)
         prepared = super().prepare(observation)
         return LikelihoodScan(prepared, length, observation)
 

@@ -6,7 +6,9 @@ With the noise of `baseline_noise`, in which x is what a map m, or the data, mak
 
 where y and s are those of `compressed_scan`, and n the samples of a baseline that count: samples
 about the mean of their baseline, without free modes, have the weight of white noise; baselines have
-that of their own spectrum. (1) is added up over scans, in their order.
+that of their own spectrum. (1) is added up over scans, in their order. Gaps (`compressed_scan`) are
+unknowns beside the map, so that noise is stationary, and shared by all detectors, where some of
+them lack samples; the map is that of the samples that count.
 
 Conjugate gradients, preconditioned with the inverse of the weights in each pixel (of I, Q and U the
 pseudo-inverse of a 3 x 3 matrix), end where the norm of the residual in that metric is `tolerance`
@@ -22,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -41,6 +43,9 @@ from .stokes_kernel import PLACES
 
 PATIENCE, RECENT = 25, 10
 """Iterations before smooth patterns are thought of; those that tell how many are left."""
+
+EXACT, MOST = 1e-10, 1000
+"""Residual at which values of gaps for a given map are known, and iterations at most."""
 
 
 @dataclass
@@ -96,10 +101,10 @@ class WeighedScan(NamedTuple):
     scan: CompressedScan
     noise: BaselineNoise
 
-    def spread(self, y: Floats, s: Floats, n_stokes: int, n_pixels: int) -> Floats:
-        """The last three terms of equation (1), (n_stokes, n_pixels)."""
+    def spread(self, y: Floats, s: Floats, n_stokes: int) -> Floats:
+        """The last three terms of equation (1), (n_stokes, scan.width)."""
         scan, noise = self
-        found = np.zeros((n_stokes, n_pixels))
+        found = np.zeros((n_stokes, scan.width))
         within = scan.counted / noise.white[:, None]
         scan.spread(noise.weigh(y, scan.counted) - within * y, -s, noise.free_modes, found)
         return found
@@ -114,7 +119,7 @@ class WeighedScan(NamedTuple):
     def freedom(self) -> float:
         """Degrees of freedom of the samples: those that neither free modes nor polynomials take."""
         scan, noise = self
-        samples = scan.counted.sum(axis=1)
+        samples = scan.known.sum(axis=1)
         free = float(((noise.modes[: noise.free] ** 2).sum(axis=0) * samples).sum())
         lines = len(noise.lines) * (np.count_nonzero(samples) - noise.free)
         return float(samples.sum()) - free - lines
@@ -135,6 +140,8 @@ class Solution(NamedTuple):
         iterations without smooth patterns, and those of the patterns.
     smooth, before
         Smooth patterns of the preconditioner, and the iterations before they were added.
+    gaps
+        (n_stokes, gaps of all scans) values there, less the mean of their baseline in the streams.
     """
 
     values: Floats
@@ -142,6 +149,7 @@ class Solution(NamedTuple):
     ritz: Floats
     smooth: SmoothPatterns | None = None
     before: int = 0
+    gaps: Floats = field(default_factory=lambda: np.zeros((1, 0)))
 
 
 @dataclass
@@ -159,10 +167,32 @@ class NormalEquations:
     places: Callable[[NDArray[np.intp]], Floats] | None = None
 
     def __post_init__(self) -> None:
-        self.weights = np.zeros((1 if self.n_stokes == 1 else 6, self.n_pixels))
-        for scan, noise in self.scans:
-            scan.weigh(1 / noise.white, self.weights)
-        self.inverse = inverse_of(self.weights)
+        rows = 1 if self.n_stokes == 1 else 6
+        self._ends = np.cumsum([self.n_pixels, *(scan.gaps for scan, _ in self.scans)]).tolist()
+        self._wide = np.zeros((rows, self._ends[-1]))
+        for k, (scan, noise) in enumerate(self.scans):
+            weights = self._part(self._wide, k)
+            scan.weigh(1 / noise.white, weights)
+            self._take(self._wide, k, weights)
+        self.weights = self._wide[:, : self.n_pixels]
+        self._inverse = np.zeros_like(self._wide)
+        self._inverse[:, : self.n_pixels] = inverse_of(self.weights)
+        self._inverse[0, self.n_pixels :] = 1 / self._wide[0, self.n_pixels :]
+        self.inverse = self._inverse[:, : self.n_pixels]
+
+    def _part(self, m: Floats, k: int) -> Floats:
+        """Map and gaps of a scan, (rows, scan.width)."""
+        gaps = slice(self._ends[k], self._ends[k + 1])
+        return np.concatenate([m[:, : self.n_pixels], m[:, gaps]], axis=1)
+
+    def _take(self, m: Floats, k: int, part: Floats) -> None:
+        """Write map and gaps of a scan into those of all."""
+        m[:, : self.n_pixels] = part[:, : self.n_pixels]
+        m[:, self._ends[k] : self._ends[k + 1]] = part[:, self.n_pixels :]
+
+    def _widened(self, m: Floats) -> Floats:
+        """A map, or one with gaps, as one with gaps; 0 there if it has none."""
+        return np.pad(m, ((0, 0), (0, self._ends[-1] - m.shape[1])))
 
     @property
     def spread(self) -> Floats:
@@ -176,49 +206,79 @@ class NormalEquations:
         return float((self.inverse[places] * self.weights[places]).sum())
 
     def chi_square(
-        self, m: Floats, right: Floats, data: Sequence[tuple[Floats, Floats]]
+        self, found: Solution, right: Floats, data: Sequence[tuple[Floats, Floats]]
     ) -> tuple[float, float]:
-        """chi^2 = (d - P m)^T Q (d - P m) of the complete signal and a map, per degree of freedom,
-        and its standard error where Q is the inverse covariance of the noise. ``right``, ``data``:
-        as of `right_side`.
+        """chi^2 = (d - P m)^T Q (d - P m) of the complete signal and its map, per degree of
+        freedom, and its standard error where Q is the inverse covariance of the noise. ``right``,
+        ``data``: as of `right_side`.
         """
         square = math.fsum(scan.square(*one) for scan, one in zip(self.scans, data, strict=True))
-        square += float((m * (self.apply(m) - 2 * right)).sum())
+        m = np.concatenate([found.values, found.gaps], axis=1)
+        square += float((m * (self._product(m) - 2 * right)).sum())
         freedom = sum(scan.freedom for scan in self.scans) - self.rank
         return float(square / freedom), math.sqrt(2 / freedom)
 
     def right_side(self, binned: Floats, data: Sequence[tuple[Floats, Floats]]) -> Floats:
-        """The right side: ``binned`` P^T d / sigma^2, and y and s of the data of each scan."""
-        return binned + self._added(data)
+        """The right side, also of gaps: ``binned`` P^T d / sigma^2, and y and s of the data of each
+        scan.
+        """
+        out = self._widened(binned)
+        for k, ((scan, noise), (y, _)) in enumerate(zip(self.scans, data, strict=True)):
+            gaps = slice(self._ends[k], self._ends[k + 1])
+            out[0, gaps] = scan.in_gaps(y / noise.white[:, None])
+        return out + self._added(data)
 
     def apply(self, m: Floats) -> Floats:
-        """P^T Q P m."""
-        return times(self.weights, m) + self._added([m] * len(self.scans))
+        """P^T Q P m, Q of the samples that count."""
+        return self.eliminated(self._product(self._widened(m)))
 
-    def solve(self, right: Floats, tolerance: float, most: int) -> Solution:
+    def eliminated(self, right: Floats) -> Floats:
+        """A right side, or a product, of the map alone (n_stokes, n_pixels): gaps are solved for by
+        conjugate gradients, and what they make of the map is taken off.
+        """
+        if right.shape[1] > self.n_pixels:
+            inverse = self._inverse.copy()
+            inverse[:, : self.n_pixels] = 0.0
+            gaps = self.solve(right, EXACT, MOST, inverse).gaps
+            zero = np.zeros((self.n_stokes, self.n_pixels))
+            right = right - self._product(np.concatenate([zero, gaps], axis=1))
+        return right[:, : self.n_pixels]
+
+    def _product(self, m: Floats) -> Floats:
+        """Left side of a map with gaps."""
+        parts = [self._part(m, k) for k in range(len(self.scans))]
+        return times(self._wide, m) + self._added(parts)
+
+    def solve(
+        self, right: Floats, tolerance: float, most: int, inverse: Floats | None = None
+    ) -> Solution:
         """Conjugate gradients from 0, at most so many iterations: the map with the least residual.
         Behind it, and along patterns that the data do not determine, there is rounding alone.
+
+        ``inverse``: of the weights of what is solved for, 0 elsewhere; None: map and gaps.
         """
+        places, right = self.places if inverse is None else None, self._widened(right)
+        weights = self._inverse if inverse is None else inverse
         m, r, smooth, before = np.zeros_like(right), right.copy(), None, 0
-        z = times(self.inverse, r)
+        z = times(weights, r)
         p, product = z.copy(), float((r * z).sum())
         first, history, ritz = product, list[float](), list[Floats]()
         steps, turns, best, size = list[float](), list[float](), m, product
         while first > 0 and len(history) < most and (not history or history[-1] >= tolerance):
-            if smooth is None and self.places and takes_long(history, tolerance):
+            if smooth is None and places and takes_long(history, tolerance):
                 smooth, before = self.smooth, len(history)
                 ritz = [ritz_values(steps, turns), smooth.information]
                 z[0] += smooth.correct(r[0])
                 p, product, steps, turns = z, float((r * z).sum()), [], []
                 size = product
                 first += float((right[0] * smooth.correct(right[0])).sum())
-            q = self.apply(p)
+            q = self._product(p)
             if (curvature := float((p * q).sum())) <= UNDETERMINED * size:
                 break
             step = product / curvature
             m += step * p
             r -= step * q
-            z = times(self.inverse, r)
+            z = times(weights, r)
             if smooth:
                 z[0] += smooth.correct(r[0])
             product, last = float((r * z).sum()), product
@@ -229,7 +289,14 @@ class NormalEquations:
                 best = m.copy()
             p, size = z + turns[-1] * p, product + turns[-1] ** 2 * size
         ritz = ritz or [ritz_values(steps, turns)]
-        return Solution(best, history, np.sort(np.concatenate(ritz)), smooth, before)
+        values, gaps = np.split(best, [self.n_pixels], axis=1)
+        return Solution(values, history, np.sort(np.concatenate(ritz)), smooth, before, gaps)
+
+    def baselines(self, found: Solution, k: int) -> Floats:
+        """Y m of a scan, (n_det, n_base): of a map and gaps that were found."""
+        scan, noise = self.scans[k]
+        m = self._part(np.concatenate([found.values, found.gaps], axis=1), k)
+        return scan.seen(m, np.zeros((0, len(noise.white))))[0]
 
     @cached_property
     def smooth(self) -> SmoothPatterns:
@@ -237,9 +304,9 @@ class NormalEquations:
         assert self.places is not None
 
         def of_intensity(m: Floats) -> Floats:
-            rows = np.zeros((self.n_stokes, self.n_pixels))
-            rows[0] = m
-            return np.asarray(self.apply(rows)[0])
+            rows = self._widened(np.zeros((self.n_stokes, self.n_pixels)))
+            rows[0, : self.n_pixels] = m
+            return np.asarray(self._product(rows)[0, : self.n_pixels])
 
         return SmoothPatterns.of(self.places, self.weights[0], of_intensity)
 
@@ -251,12 +318,13 @@ class NormalEquations:
         def one(weighed: WeighedScan, what: Floats | tuple[Floats, Floats]) -> Floats:
             scan, noise = weighed
             y, s = what if isinstance(what, tuple) else scan.seen(what, noise.free_modes)
-            return weighed.spread(y, s, self.n_stokes, self.n_pixels)
+            return weighed.spread(y, s, self.n_stokes)
 
-        total = np.zeros((self.n_stokes, self.n_pixels))
+        total = np.zeros((self.n_stokes, self._ends[-1]))
         items = list(zip(self.scans, of, strict=True))
-        for part in in_order(one, items, min(self.threads, len(items))):
-            total += part
+        for k, part in enumerate(in_order(one, items, min(self.threads, len(items)))):
+            total[:, : self.n_pixels] += part[:, : self.n_pixels]
+            total[:, self._ends[k] : self._ends[k + 1]] = part[:, self.n_pixels :]
         return total
 
 

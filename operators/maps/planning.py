@@ -15,6 +15,7 @@ from zonda.core.plan.planning import Planning, samples_in
 from .bin_map import BinMap
 from .coverage import COUNTS
 from .grid import in_frame
+from .map_layout import MapLayout
 from .maximum_likelihood import SHORTEST, MaximumLikelihoodMap
 
 HEALPY = 32_000_000
@@ -107,15 +108,21 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
 
     def compressed(self, observation: Observation) -> int:
         """Bytes of all compressed scans: 6 r N + (12 + 8 n) N / L + 8 n k T for n signals and k
-        free modes of N samples at T instants, r runs a sample; 22 r N with I, Q and U.
+        free modes of N samples at T instants, r runs a sample, and 6 a gap; 22 r N with I, Q and U.
         """
         step, signals = self.operator, len(observation.signals)
         samples, instants = step._samples
         baselines = samples / max(step.baseline * observation.sample_rate, 1)
         free = 8 * signals * step.free * instants
-        return int(
-            self.of_run * samples * self.runs(observation) + (12 + 8 * signals) * baselines + free
-        )
+        runs = samples * self.runs(observation) + self.gaps(observation)
+        return int(self.of_run * runs + (12 + 8 * signals) * baselines + free)
+
+    def gaps(self, observation: Observation) -> float:
+        """Samples outside a map of a given width, each an unknown."""
+        step = self.operator
+        if step.width is None:
+            return 0.0
+        return MapLayout(step).outside([observation], step.grid) * step._samples[0]
 
     @property
     def of_run(self) -> int:
@@ -135,6 +142,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         block = (max(step.patterns, 3 * stokes) + 1) * bool(step.patterns)
         maps = (15 + 3 * at_once + 14 * block) * stokes + weights + 6 + halves
         product += 8 * stokes * (1 + step.patterns) * self.pixels
+        most += int(8 * (12 * stokes + 2) * self.gaps(observation))
         scan = int(50 * self.baselines(observation)) + 32 * free * observation.n_samples
         return most + 8 * maps * self.pixels + at_once * scan, product + COMPILED
 
