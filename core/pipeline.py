@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from .assembly import arguments
-from .assembly.chain import Chain
 from .assembly.order import check_order
-from .assembly.signals import Signals, acting_steps, note_signals, remainder
+from .assembly.signals import Chain, Signals, acting_steps, note_signals, remainder
 from .configuration.input_paths import paths_in
 from .data import Data
 from .errors import PipelineError

@@ -142,7 +142,7 @@ class Filters(LinearOperator):
         steps = [o for o in arguments.steps(given, "zonda.linear") if filters_signals(o)]
         named = [*zip(labels(steps), steps, strict=True)]
         for label, step in named:
-            check_adjoint(step, label, observation)
+            self._refuse_without_adjoint(label, step)
         self.steps = [(label, step, step.prepare(self.observation)) for label, step in named]
         samples = observation.n_detectors * observation.n_samples
         super().__init__(np.float64, (samples, samples))  # type: ignore[call-arg]
@@ -179,6 +179,29 @@ class Filters(LinearOperator):
             Stream(MAIN, self.observation, array, {}, 1, signal=signal, state=state), model
         )
 
+    def _refuse_without_adjoint(self, label: str, step: Operator) -> None:
+        """Refuse a filter without an exact adjoint: its class has no ``adjoint(block, state)``, or
+        one of a class whose ``exec`` it overrides; or it joins several bands.
+        """
+        owner = {
+            name: k
+            for name in ("exec", "adjoint")
+            for k, cls in reversed([*enumerate(type(step).__mro__)])
+            if name in vars(cls)
+        }
+        if owner.get("adjoint", len(type(step).__mro__)) > owner["exec"]:
+            raise PipelineError(
+                f"{type(step).__name__} has no exact adjoint",
+                place=f"zonda.linear.filters, {label}",
+                cure="leave it out, or write its method adjoint(block, state) beside exec",
+            )
+        if joins(step) and self.observation.common is not None:
+            raise PipelineError(
+                "the modes are those of all bands, and the streams those of one",
+                place=f"zonda.linear.filters, {label}",
+                cure="set group: band or wafer",
+            )
+
     def _block(self, d: Floats) -> Block:
         """All of a stream, a copy, as one block."""
         scan = self.observation
@@ -199,30 +222,6 @@ def own_copy(observation: Observation) -> Observation:
         detector_flags=observation.detector_flags.copy(),
         windows=dict(observation.windows),
     )
-
-
-def check_adjoint(step: Operator, label: str, observation: Observation) -> None:
-    """Refuse a filter without an exact adjoint: its class has no ``adjoint(block, state)``, or one
-    of a class whose ``exec`` it overrides; or it joins several bands.
-    """
-    owner = {
-        name: k
-        for name in ("exec", "adjoint")
-        for k, cls in reversed([*enumerate(type(step).__mro__)])
-        if name in vars(cls)
-    }
-    if owner.get("adjoint", len(type(step).__mro__)) > owner["exec"]:
-        raise PipelineError(
-            f"{type(step).__name__} has no exact adjoint",
-            place=f"zonda.linear.filters, {label}",
-            cure="leave it out, or write its method adjoint(block, state) beside exec",
-        )
-    if joins(step) and observation.common is not None:
-        raise PipelineError(
-            "the modes are those of all bands, and the streams those of one",
-            place=f"zonda.linear.filters, {label}",
-            cure="set group: band or wafer",
-        )
 
 
 def filters(pipeline: Steps, observation: Observation, modes: Any = None) -> Filters:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assembly.chain import Chain
+from ..assembly.signals import Chain
 from ..data import Observation
 from ..mapmaker import joins
 from ..numerics.radiation import LEAST_TRANSMISSION

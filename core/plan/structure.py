@@ -13,8 +13,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from ..assembly.chain import Chain
-from ..assembly.signals import Signals, acting_steps, remainder
+from ..assembly.signals import Chain, Signals, acting_steps, remainder
 from ..configuration.diagnostics import nearest
 from ..configuration.loaded import PipelineFile
 from ..errors import ZondaError

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..assembly.chain import Chain
+from ..assembly.signals import Chain
 from ..data import Data
 from ..observation import Observation
 from ..operator import Operator

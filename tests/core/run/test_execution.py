@@ -8,7 +8,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from zonda.core.assembly.chain import Chain
+from zonda.core.assembly.signals import Chain
 from zonda.core.data import Block, Data
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import TILE_SAMPLES

@@ -21,7 +21,7 @@ from tests.core.run.test_execution import (
     observation,
     peak_of_streams_and_blocks,
 )
-from zonda.core.assembly.chain import Chain
+from zonda.core.assembly.signals import Chain
 from zonda.core.errors import PipelineError
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning

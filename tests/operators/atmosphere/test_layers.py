@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from zonda.core.assembly.chain import Chain
+from zonda.core.assembly.signals import Chain
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import ZondaError
