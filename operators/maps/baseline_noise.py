@@ -19,8 +19,10 @@ that of the noise itself makes the one of least noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +76,8 @@ class BaselineNoise:
         take a part.
     edges
         (n_bins + 1,) first frequency of each bin, and the end.
+    groups
+        (n_det,) number of the group with which each detector has modes in common: of a wafer, or 0.
     """
 
     white: Floats
@@ -89,6 +93,7 @@ class BaselineNoise:
     least: Floats
     fast: Floats
     freedom: Floats
+    groups: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
 
     @property
     def free_modes(self) -> Floats:
@@ -122,6 +127,7 @@ def estimate(
     trend: int,
     fixed: Floats | None = None,
     lacking: NDArray[np.bool_] | None = None,
+    groups: NDArray[np.intp] | None = None,
 ) -> BaselineNoise:
     """Estimate the noise from baselines without a source, (n_det, n_base) [K].
 
@@ -134,13 +140,15 @@ def estimate(
     length, rate
         Samples of a baseline; samples per second.
     modes, free
-        Modes that detectors share, and how many of these have no weight.
+        Modes that detectors of a group share, and how many of these have no weight.
     trend
         Degree of the polynomials of each detector's scan.
     fixed
         (free, n_det) the free modes, where they are known.
     lacking
         (n_det, n_base) baselines that were `filled`: they have no noise of their own.
+    groups
+        (n_det,) see `BaselineNoise`; None: all detectors are one.
     """
     n_det, n_base = residual.shape
     seen_of_each = np.count_nonzero(counted, axis=1)[:, None]
@@ -154,9 +162,11 @@ def estimate(
     top = min(max(int(SLOW * length / rate * n_base), FEWEST), powers.shape[1])
     slow = np.concatenate([powers[:, 1:top].real, powers[:, 1:top].imag], axis=1)
     n_seen = int(np.count_nonzero(seen_of_each))
-    modes = max(min(modes, n_seen - 1), 0)
+    groups = np.zeros(n_det, np.intp) if groups is None else groups
+    seen_in = [int(np.count_nonzero(seen_of_each[at])) for at in members(groups)]
     known = np.zeros((0, n_det)) if fixed is None else fixed
-    found = leading(slow, modes, known)
+    found = leading_of(groups, slow, [max(min(modes, n - 1), 0) for n in seen_in], known)
+    free, modes = sum(max(min(free, modes, n - 1), 0) for n in seen_in), len(found)
     seen = np.einsum("kd,dt->kt", found, slow)
     values = np.einsum("kt,kt->k", seen, seen) / max(top - 1, 1)
     edges = bins_of(powers.shape[1])
@@ -184,7 +194,7 @@ def estimate(
         length,
         lines,
         found,
-        min(free, modes),
+        free,
         values,
         middle,
         edges,
@@ -194,23 +204,53 @@ def estimate(
         fast,
         np.where(edges[:-1] < (1 + LOWEST) / share, 0, 2 * np.diff(edges) * share)
         * max(n_seen - modes, 1),
+        groups,
     )
 
 
+def members(groups: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """The detectors of each group."""
+    return [np.flatnonzero(groups == number) for number in np.unique(groups)]
+
+
+def leading_of(
+    groups: NDArray[np.intp], rows: Floats, numbers: Sequence[int], known: Floats
+) -> Floats:
+    """`leading` vectors of each group, as many as its number, 0 for other detectors: the first of
+    all groups, then the second of all ...; some are ``known`` (k, n_det).
+    """
+    found = []
+    for number, at in zip(numbers, members(groups), strict=True):
+        own = known[(known[:, at] != 0).any(axis=1)][:number, at]
+        vectors = np.zeros((number, len(rows)))
+        vectors[:, at] = leading(rows[at], number, own)
+        found += list(enumerate(vectors))
+    ordered = [vector for _, vector in sorted(found, key=itemgetter(0))]
+    return np.array(ordered).reshape(-1, len(rows))
+
+
 def filled(
-    y: Floats, lacking: NDArray[np.bool_], white: Floats, mode: Floats, trend: int
+    y: Floats,
+    lacking: NDArray[np.bool_],
+    white: Floats,
+    mode: Floats,
+    trend: int,
+    groups: NDArray[np.intp],
 ) -> Floats:
     """Baselines (n_det, n_base) [K]; those that are ``lacking`` (n_det, n_base) are what the others
-    at that time see of a mode (n_det,), and a polynomial of the detector. Linear in y.
+    of the group at that time see of a mode (n_det,), and a polynomial of the detector. Linear in y.
     """
     if not lacking.any():
         return y
     g, lines = np.sqrt(white)[:, None], polynomials(y.shape[1], trend)
     z, own = np.where(lacking, 0.0, y / g), np.zeros(y.shape)
     weights = np.where(lacking, 0.0, mode[:, None])
-    weights /= np.maximum((weights * mode[:, None]).sum(axis=0), 1e-300)
+    common, detectors = np.zeros(y.shape), members(groups)
+    for at in detectors:
+        weights[at] /= np.maximum((weights[at] * mode[at, None]).sum(axis=0), 1e-300)
     for _ in range(FILLS):
-        common = mode[:, None] * ((z - own) * weights).sum(axis=0)
+        for at in detectors:
+            common[at] = mode[at, None] * ((z[at] - own[at]) * weights[at]).sum(axis=0)
         rest = np.where(lacking, own, z - common)
         own = np.einsum("dp,pt->dt", np.einsum("dt,pt->dp", rest, lines), lines)
     return np.where(lacking, (own + common) * g, y)

@@ -163,6 +163,7 @@ class LikelihoodMaps(MapFromSums):
                     trend=step.trend,
                     fixed=noise.modes[: noise.free],
                     lacking=scan.lacking,
+                    groups=noise.groups,
                 )
                 if step.noise != "estimated":
                     new = replace(new, own=noise.own)  # that of a table

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
+from zonda.core.observation import Observation
 
 from .parameters import MapParameters
 
@@ -23,6 +26,9 @@ class LikelihoodParameters(MapParameters):
     detectors (destriping with a noise prior)."""
     free: int = Field(1, ge=0, le=20)
     """How many of the modes have no weight at any frequency, within baselines too."""
+    group: Literal["band", "wafer"] = "band"
+    """The detectors that share modes: those of a band, or of each wafer, which then has `modes` and
+    `free` of its own."""
     trend: int = Field(1, ge=0, le=10)
     """Degree of the polynomial of each detector's scan that is taken off."""
     noise: Literal["estimated", "simulated"] | InputPath = "estimated"  # type: ignore[assignment]
@@ -36,6 +42,13 @@ class LikelihoodParameters(MapParameters):
     undetermined: Literal["none", "mean", "plane"] | None = None
     """What is taken off the map of I, weighted by its hits, since the data hardly determine it;
     where absent, a plane of a TAN image, the mean of other maps."""
+
+    @field_validator("group", mode="before")
+    @classmethod
+    def _bands_are_apart(cls, value: Any) -> Any:
+        if value == "all":
+            raise ValueError("each band has a map and modes of its own; write band or wafer")
+        return value
 
     @field_validator("noise", mode="before")
     @classmethod
@@ -64,6 +77,11 @@ class LikelihoodParameters(MapParameters):
         if self.undetermined == "plane" and self.kind != "TAN":
             raise ValueError("undetermined: plane is for TAN images; choose none or mean")
         return self
+
+    def groups_of(self, observation: Observation) -> NDArray[np.intp]:
+        """(n_det,) number of the group of each detector."""
+        plane = observation.focalplane
+        return np.asarray(plane.wafer if self.group == "wafer" else 0 * plane.wafer, np.intp)
 
     @property
     def taken_off(self) -> Literal["none", "mean", "plane"]:

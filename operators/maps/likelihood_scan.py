@@ -149,9 +149,10 @@ class LikelihoodScan:
         what all see alike, then by the first mode that is found: a fit of more is not stable.
         """
         lacking, self.filler = self.scan.lacking, np.sqrt(1 / white / (1 / white).sum())
+        groups = step.groups_of(self.observation)[self.rows]
         for _ in range(FILLED):
             noise = estimate(
-                filled(self.found.means, lacking, white, self.filler, step.trend),
+                filled(self.found.means, lacking, white, self.filler, step.trend, groups),
                 self.scan.counted,
                 white,
                 self.length,
@@ -160,9 +161,11 @@ class LikelihoodScan:
                 free=step.free,
                 trend=step.trend,
                 lacking=lacking,
+                groups=groups,
             )
             before = self.filler
-            self.filler = noise.modes[0] if len(noise.modes) else before
+            if len(noise.modes):
+                self.filler = noise.modes[: len(np.unique(groups))].sum(axis=0)
             if not lacking.any() or np.abs(self.filler - before).max() < STILL:
                 break
         return noise
@@ -253,7 +256,9 @@ class LikelihoodScan:
         scan, noise, a = self.scan, self.noise, self.noise.free_modes
         for name, sums in self.baselines.items():
             y = sums / VALUE / np.maximum(scan.known, 1)
-            y = filled(y, scan.lacking, noise.white, self.filler, len(noise.lines) - 1)
+            y = filled(
+                y, scan.lacking, noise.white, self.filler, len(noise.lines) - 1, noise.groups
+            )
             s = self.common[name] / (VALUE * self.scale)
             data[name] = (y, scan.about_means(s, y, a))
         return Compressed(scan, self.noise, data)

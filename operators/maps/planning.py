@@ -99,11 +99,11 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """The compressed scans; twice the runs of a scan while these are put in order, sums and
         spectra of its baselines; and its compiled code.
         """
-        step, signals = self.operator, len(observation.signals)
+        signals = len(observation.signals)
         samples = observation.n_samples * observation.n_detectors
         own = self.of_run * samples * self.runs(observation)
         own += (60 + 8 * signals) * self.baselines(observation)
-        own += 16 * signals * step.free * observation.n_samples
+        own += 16 * signals * self.free(observation) * observation.n_samples
         return super().memory(observation) + self.compressed(observation) + int(own) + COMPILED
 
     def compressed(self, observation: Observation) -> int:
@@ -113,9 +113,13 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         step, signals = self.operator, len(observation.signals)
         samples, instants = step._samples
         baselines = samples / max(step.baseline * observation.sample_rate, 1)
-        free = 8 * signals * step.free * instants
+        free = 8 * signals * self.free(observation) * instants
         runs = samples * self.runs(observation) + self.gaps(observation)
         return int(self.of_run * runs + (12 + 8 * signals) * baselines + free)
+
+    def free(self, observation: Observation) -> int:
+        """Free modes of all groups."""
+        return self.operator.free * len(np.unique(self.operator.groups_of(observation)))
 
     def gaps(self, observation: Observation) -> float:
         """Samples outside a map of a given width, each an unknown."""
@@ -137,7 +141,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         most, product = super().finished(observation)
         stokes, weights = (3, 12) if self.polarized else (1, 2)
         halves = 2 * (stokes + weights) * bool(self.operator.half_difference)
-        at_once, free = self.operator._at_once, self.operator.free
+        at_once, free = self.operator._at_once, self.free(observation)
         step = self.operator
         block = (max(step.patterns, 3 * stokes) + 1) * bool(step.patterns)
         maps = (15 + 3 * at_once + 14 * block) * stokes + weights + 6 + halves

@@ -6,10 +6,10 @@ and the part of pink noise that all have in common. In equation (2) of `baseline
 
     E_k(f) = q_k^T S q_k,   D(f) = 1 + pink noise of its own + (tr S - sum_k E_k) / (n - k).
 
-q_1 is what all see alike, the mean emission of the atmosphere too; the others are the leading
-eigenvectors of S below `SLOW` beside it. The two ends of a scan of T seconds do not meet: this step
-of variance 2 int P df adds 4 int P df / T / (2 pi f)^2 to each spectrum P. That baselines average
-samples is left out; it matters where white noise is the larger.
+q_1 is what all see alike (or each wafer), the mean emission of the atmosphere too; the others are
+the leading eigenvectors of S below `SLOW` beside it. The two ends of a scan of T seconds do not
+meet: this step of variance 2 int P df adds 4 int P df / T / (2 pi f)^2 to each spectrum P. That
+baselines average samples is left out; it matters where white noise is the larger.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.observation import ClosedForm
 from zonda.core.types import Floats
 
-from .baseline_noise import SLOW, BaselineNoise, leading
+from .baseline_noise import SLOW, BaselineNoise, leading_of, members
 
 WAVES, ANGLES = 30, 12
 """Wave numbers across the focal plane, and directions of half a turn, isotropic in the mean."""
@@ -65,12 +65,14 @@ def of_scene(
     powers += 4 / seconds**2 * np.einsum("f,fw->w", number, powers) / (2 * np.pi * f[:, None]) ** 2
     slow = np.where(f < SLOW, number, 0.0)
     slow[0] = 0.0
-    alike = waves[:, 0] / np.sqrt((waves[:, 0] ** 2).sum())
-    q = leading(
-        columns * np.sqrt(np.einsum("f,fw->w", slow, powers)),
-        len(found.modes),
-        alike[None][: len(found.modes)],
-    )
+    alike = waves[:, 0]
+    groups = members(found.groups)
+    first = np.zeros((len(groups), n))
+    for row, at in zip(first, groups, strict=True):
+        row[at] = alike[at] / np.sqrt((alike[at] ** 2).sum())
+    numbers = [int((found.modes[:, at] != 0).any(axis=1).sum()) for at in groups]
+    weighed = columns * np.sqrt(np.einsum("f,fw->w", slow, powers))
+    q = leading_of(found.groups, weighed, numbers, first)
     spectra = np.einsum("fw,kw->fk", powers, np.einsum("kd,dw->kw", q, columns) ** 2)
     whole_power = np.einsum("fw,w->f", powers, (columns**2).sum(axis=0))
     rest = whole_power - spectra.sum(axis=1)

@@ -480,6 +480,24 @@ def test_gaps_of_some_detectors_leave_the_noise_as_it_is(gaps):
     assert np.nanmedian(found.noise * np.sqrt(found.hits)) == pytest.approx(SIGMA, rel=0.2)
 
 
+@pytest.mark.parametrize("gaps", [False, True])
+def test_wafers_have_modes_of_their_own(gaps):
+    """Three wafers with a walk each: one free mode of each takes it, one of all does not."""
+    o, rng = observation(), np.random.default_rng(18)
+    o.focalplane.wafer[:] = np.arange(37) % 3
+    walks = np.cumsum(rng.normal(size=(3, o.n_samples)), axis=1) * 2 * SIGMA
+    noise = walks[o.focalplane.wafer] + SIGMA * rng.normal(size=(37, o.n_samples))
+    if gaps:
+        noise[::2, 2000:4000] = np.nan
+    how = {"modes": 1, "free": 1}
+    wafers, band = mapped(o, noise, group="wafer", **how), mapped(o, noise, **how)
+    # as without wafers: a third of what detectors have in common is lost, three times
+    assert excess(wafers) < 1.25
+    assert excess(band) > 1.5 * excess(wafers)
+    with pytest.raises(zonda.ZondaError, match="band or wafer"):
+        MaximumLikelihoodMap(group="all")
+
+
 def test_a_load_of_each_detector_leaves_the_map_as_it_is():
     """The line of a detector is one over its gaps too: here most have some."""
     o, rng = observation(), np.random.default_rng(12)

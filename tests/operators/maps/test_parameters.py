@@ -59,6 +59,7 @@ STEPS = (
             "baseline": ({}, {"baseline": "0.4 s"}),
             "modes": ({}, {"modes": 2}),
             "free": ({}, {"free": 0}),
+            "group": ({}, {"group": "wafer"}),
             "trend": ({}, {"trend": 2}),
             "noise": ({}, {"noise": "simulated"}),
             "refine": ({}, {"refine": 0}),
