@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 FILLED, STILL = 60, 1e-6
 """How often the mode that fills baselines is sought at most, and the change after which it stays.
 """
+MOST_APART = 1e4
+"""Ratio of variances of white noise, as found and by the NET: weights beyond it do not fit."""
 LOCK = threading.Lock()
 """Held while a thread adds to the sums of a scan."""
 
@@ -93,7 +95,9 @@ class LikelihoodScan:
         self.rows = np.flatnonzero(observation.good_detectors)
         if not self.rows.size:
             raise PipelineError(
-                "no detector is good", place=f"{place}, {observation.name}", cure="look at the log"
+                "no detector is good",
+                place=f"{place}, {observation.name}",
+                cure="leave this scan out, or look at the flags of its detectors",
             )
         self.found = RunsOfTiles(self.rows.size, observation.n_samples, self.length)
         angles = self.prepared.halves[0][0].angles
@@ -134,13 +138,17 @@ class LikelihoodScan:
         observation, white = self.observation, np.asarray(self.found.scatter)
         place = f"{place}, {observation.name}"
         if np.isnan(white).all():
-            raise PipelineError("no samples count", place=place, cure="look at the log")
+            raise PipelineError(
+                "no sample counts: all are flagged or not finite",
+                place=place,
+                cure="leave this scan out, or look at the flags of its samples",
+            )
         if (white <= 0).any():
             name = observation.focalplane.names[self.rows[np.flatnonzero(white <= 0)[0]]]
             raise PipelineError(
                 f"detector {name} has no noise",
                 place=place,
-                cure="add WhiteNoise, or make the map with BinMap",
+                cure="add WhiteNoise, or flag this detector; or make the map with BinMap",
             )
         return np.where(np.isnan(white), np.nanmedian(white), white)
 
@@ -196,12 +204,23 @@ class LikelihoodScan:
         text = f"{ratio:.4g}"
         observation.log.state(step.label, "its white level over that of the streams, median", text)
 
-    def give_weights(self, reference: float, spare: Any) -> None:
+    def give_weights(self, reference: float, spare: Any, place: str) -> None:
         """Weigh detectors by the white level that was found, in units of the inverse variance
-        ``reference``, K^2.
+        ``reference``, K^2. Raises PipelineError for a level that is far from it.
         """
         observation, first = self.observation, self.prepared.halves[0][0]
         weight = np.ones(observation.n_detectors)
+        apart = np.abs(np.log(self.noise.white / reference))
+        if apart.max() > np.log(MOST_APART):
+            k = int(apart.argmax())
+            raise PipelineError(
+                f"white noise of detector {observation.focalplane.names[self.rows[k]]} is"
+                f" {np.sqrt(self.noise.white[k]):.2g} K a sample, and"
+                f" {np.sqrt(reference):.2g} K by the NET of the first scan",
+                place=f"{place}, {observation.name}",
+                cure="add WhiteNoise, or make the map with BinMap; for recorded streams, state"
+                " their unit and NET",
+            )
         rounded = np.rint(reference / self.noise.white * WEIGHT) / WEIGHT
         weight[self.rows] = rounded
         self.noise = replace(self.noise, white=reference / rounded)

@@ -89,7 +89,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
     def _length(self, observation: Observation) -> int:
         """Samples of a baseline. Raises PipelineError for too few or too short baselines."""
         length = max(round(self.baseline * observation.sample_rate), 1)
-        number, place = -(-observation.n_samples // length), f"{self.label}, {observation.name}"
+        place = f"{self.label}, {observation.name}"
         if length < 2:
             raise PipelineError(
                 f"a baseline of {self.baseline:g} s has one sample, at"
@@ -97,15 +97,19 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
                 place=place,
                 cure=f"set baseline: {4 / observation.sample_rate:.2g} s, or longer",
             )
-        if number < SHORTEST + self.trend:
+        self._need_baselines(-(-observation.n_samples // length), place)
+        return length
+
+    def _need_baselines(self, number: int, place: str) -> None:
+        needed = SHORTEST + self.trend
+        if number < needed:
             raise PipelineError(
-                f"the scan has {number} baselines of {self.baseline:g} s, too few to find its noise"
-                " from",
+                f"the scan has samples in {number} baselines of {self.baseline:g} s, too few to find"
+                " its noise from",
                 place=place,
-                cure=f"set a shorter baseline, of which a scan has {SHORTEST + self.trend} or more;"
+                cure=f"set a shorter baseline, of which a scan has {needed} or more;"
                 " or make the map with BinMap",
             )
-        return length
 
     def prepare(self, observation: Observation) -> LikelihoodScan:  # type: ignore[override]
         """Pixels and baselines of one observation, before its samples are read.
@@ -129,6 +133,8 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         scan: LikelihoodScan = stream.state
         scan.compress(stream, self.label)
         observation, white = stream.observation, scan.white(self.label)
+        place = f"{self.label}, {observation.name}"
+        self._need_baselines(int(np.count_nonzero(scan.found.counted.any(axis=0))), place)
         for _ in range(WHITE_LEVELS):
             scan.noise = scan.estimate(white, self)
             white = np.where(scan.noise.fast < STEADY, white * scan.noise.fast, white)
@@ -141,12 +147,12 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
             raise PipelineError(
                 f"slow noise has {power.min():.2g} of the power of white noise: a"
                 " filter has removed it, and the signal with it",
-                place=f"{self.label}, {observation.name}",
+                place=place,
                 cure=f"put {type(self).__name__} before filters, or leave these out",
             )
         if self.noise != "estimated":
             scan.state_noise(self, self._table)
-        scan.give_weights(self._layout["variance"], self._spare)
+        scan.give_weights(self._layout["variance"], self._spare, self.label)
         return scan
 
     def exec(self, block: Block, state: LikelihoodScan) -> None:  # type: ignore[override]

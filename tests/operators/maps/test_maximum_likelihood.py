@@ -420,6 +420,15 @@ def test_streams_without_noise_are_refused():
         run([MaximumLikelihoodMap(pixel="15 arcsec")], o, np.zeros((o.n_detectors, o.n_samples)))
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_noise_that_is_not_that_of_the_net_is_refused(scale):
+    """A scene without white noise has that of rounding; a stream may be in another unit."""
+    o, rng = observation(), np.random.default_rng(6)
+    with pytest.raises(PipelineError, match="by the NET") as caught:
+        mapped(o, scale * SIGMA * rng.normal(size=(o.n_detectors, o.n_samples)))
+    assert "unit" in caught.value.cure
+
+
 def test_flagged_samples_and_detectors_have_no_part():
     """Their values change no bit of the map."""
     o, rng = observation(), np.random.default_rng(7)
@@ -529,15 +538,15 @@ def test_a_detector_without_samples_has_no_part():
     found = mapped(o, noise)
     ok = found.known & (found.hits > 50)
     assert (found.signal / found.noise)[ok].std() < 1.5
-    with pytest.raises(PipelineError, match="no samples count"):
+    with pytest.raises(PipelineError, match="no sample counts"):
         mapped(o, np.full_like(noise, np.nan))
 
 
 @pytest.mark.parametrize(
     ("n", "how", "cause", "cure"),
     [
-        (10, {}, "has 1 baselines", "shorter baseline"),
-        (300, {}, "has 15 baselines", "shorter baseline"),
+        (10, {}, "in 1 baselines", "shorter baseline"),
+        (300, {}, "in 15 baselines", "shorter baseline"),
         (6000, {"baseline": "5 ms"}, "one sample", "0.04 s"),
     ],
 )
@@ -547,3 +556,10 @@ def test_scans_that_tell_too_little_are_refused(n, how, cause, cure):
     with pytest.raises(PipelineError, match=cause) as caught:
         mapped(o, noise, **how)
     assert cure in caught.value.cure
+
+
+def test_a_scan_of_which_little_counts_is_refused():
+    o = scan(5, 6000, radius=3.0)
+    o.flags[100:] = 2
+    with pytest.raises(PipelineError, match="in 5 baselines"):
+        mapped(o, SIGMA * np.random.default_rng(15).normal(size=(5, 6000)))
