@@ -104,8 +104,8 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         needed = SHORTEST + self.trend
         if number < needed:
             raise PipelineError(
-                f"the scan has samples in {number} baselines of {self.baseline:g} s, too few to find"
-                " its noise from",
+                f"the scan has samples in {number} baselines of {self.baseline:g} s, too few to"
+                " find its noise from",
                 place=place,
                 cure=f"set a shorter baseline, of which a scan has {needed} or more;"
                 " or make the map with BinMap",
