@@ -33,7 +33,7 @@ ELSEWHERE = {
         ("interop.md", k): "needs TOAST or sotodlib: tests/interop, in the environments of .ci"
         for k in (1, 2, 3, 5, 6, 7, 8)
     },
-    ("map_makers.md", 2): "test_an_iterated_map_leaves_nothing_to_filters",
+    ("map_makers.md", 3): "test_an_iterated_map_leaves_nothing_to_filters",
     ("plugins.md", 4): "test_the_instrument_that_the_page_for_authors_shows",
     ("sky.md", 4): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
     ("sky.md", 5): "needs PySM: tests/operators/sky/test_pysm.py, in the environment of .ci/pysm",
