@@ -278,14 +278,13 @@ def templates(seeds: list[int]) -> None:
             filtered = float(np.nansum(w * made[f"{name}/binned"].signal)) / SMALL
             rows.append((1 / size / SMALL, z / size, filtered, float(np.nansum(w * noise))))
         print(seed, *(" ".join(f"{x:.4g}" for x in row) for row in rows[-len(PLACES) :]), sep="; ")
-    found = np.array(rows)
-    likely, binned = found[:, 0].mean(), found[:, 2].mean() / np.sqrt((found[:, 3] ** 2).mean())
-    n = len(found)
+    found, n = np.array(rows), len(rows)
+    rms, error = np.sqrt((found**2).mean(axis=0)), 1 / np.sqrt(2 * n)
+    likely, binned = found[:, 0].mean(), found[:, 2].mean() / rms[3]
     print(
         f"template, {n} draws: S/N {likely:.2f} of maximum likelihood, rms of deviates"
-        f" {np.sqrt((found[:, 1] ** 2).mean()):.3f} +- {1 / np.sqrt(2 * n):.3f};"
-        f" {binned:.2f} +- {binned / np.sqrt(2 * n):.2f} of filter and bin;"
-        f" ratio {likely / binned:.2f}"
+        f" {rms[1]:.3f} +- {error:.3f}; {binned:.2f} +- {binned * error:.2f} of filter and bin;"
+        f" ratio {likely / binned:.2f}, by the scatter of both {likely / rms[1] / binned:.2f}"
     )
 
 

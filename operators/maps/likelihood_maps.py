@@ -138,7 +138,34 @@ class LikelihoodMaps(MapFromSums):
             return made
         t = np.zeros((len(rows), self.grid.n_pixels))
         t[:, self._seen] = np.nan_to_num(rows).reshape(len(rows), -1)
-        return made.with_planes(template=self._rows(product, self.equations.apply(t)))
+        return made.with_planes(template=self._rows(product, self._as_template(t, product)))
+
+    def _as_template(self, t: Floats, product: MapProduct) -> Floats:
+        """A t of a map (n_stokes, n_pixels), less what belongs to the patterns P that are taken
+        off:
+
+            A' t,   A' = A - A P (P^T A P)^-1 P^T A,                                            (1)
+
+        the weights of t beside unknown amplitudes of P. A' P = 0.
+        """
+        equations = self.equations
+        weights, patterns = equations.apply(t), np.zeros((len(self._patterns), *t.shape))
+        patterns[:, 0, self._seen] = np.where(
+            product.known.ravel(), self._patterns[:, self._seen], 0
+        )
+        products = [equations.apply(one) for one in patterns]
+        for k, one in enumerate(patterns):
+            for other, product_of in zip(patterns[:k], products[:k], strict=True):
+                share = float((one * product_of).sum())
+                one -= share * other
+                products[k] = products[k] - share * product_of
+            size = float((one * products[k]).sum())
+            least = UNDETERMINED * float((equations.weights[0] * one[0] ** 2).sum())
+            unit = 1 / np.sqrt(size) if size > least else 0.0
+            one *= unit
+            products[k] = products[k] * unit
+            weights -= float((one * weights).sum()) * products[k]
+        return weights
 
     @cached_property
     def equations(self) -> NormalEquations:
@@ -212,6 +239,17 @@ class LikelihoodMaps(MapFromSums):
         """`taken_off`, as products state it."""
         return self.parameters.taken_off.removeprefix("none")
 
+    @cached_property
+    def _patterns(self) -> Floats:
+        """(k, n_pixels) patterns that are taken off I."""
+        made, taken = [], self.parameters.taken_off
+        if taken != "none":
+            made.append(np.ones(self.grid.n_pixels))
+        if taken == "plane":
+            rows, columns = np.indices(self.grid.shape)
+            made += [rows.ravel() - rows.mean(), columns.ravel() - columns.mean()]
+        return np.array(made).reshape(-1, self.grid.n_pixels)
+
     def _determined(
         self,
         values: Floats,
@@ -223,16 +261,13 @@ class LikelihoodMaps(MapFromSums):
         weight[self._seen] = np.where(
             product.known, equations.weights[0][self._seen].reshape(product.hits.shape), 0.0
         ).ravel()
-        if self.parameters.taken_off == "none":
+        patterns = self._patterns
+        if not len(patterns):
             return values
-        patterns = [np.ones(self.grid.n_pixels)]
-        if self.parameters.taken_off == "plane":
-            rows, columns = np.indices(self.grid.shape)
-            patterns += [rows.ravel() - rows.mean(), columns.ravel() - columns.mean()]
-        basis = np.array(patterns) * np.sqrt(weight)
+        basis = patterns * np.sqrt(weight)
         matrix = np.einsum("ip,jp->ij", basis, basis)
         right = np.einsum("ip,p->i", basis, values[0] * np.sqrt(weight))
-        values[0] -= np.einsum("i,ip->p", np.linalg.lstsq(matrix, right)[0], np.array(patterns))
+        values[0] -= np.einsum("i,ip->p", np.linalg.lstsq(matrix, right)[0], patterns)
         return values
 
     def _rows(self, product: MapProduct, values: Floats) -> Floats:

@@ -163,6 +163,36 @@ def test_a_template_in_white_noise(found):
     assert matched(found["true/map"], m)[1] == pytest.approx(error, rel=0.02)
 
 
+def test_what_is_taken_off_has_no_weight(found):
+    """A' P = 0: a mean and a plane added to the map change no amplitude, to the rounding of A."""
+    t, m = found["model/map"], found["map"]
+    amplitude, error = matched(t, m)
+    y, x = np.indices(m.hits.shape)
+    for pattern in (np.ones(m.hits.shape), y - y.mean(), x - x.mean()):
+        changed = m.with_planes(signal=m.signal + 1e-3 * pattern)  # 10 times the noise or more
+        assert matched(t, changed)[0] == pytest.approx(amplitude, abs=1e-6 * error)
+
+
+@pytest.mark.nightly
+def test_deviates_of_noise_have_their_variance():
+    """Amplitudes of a cluster in maps of white noise, of which a plane is taken off: with A instead
+    of A' they would scatter by more, since the plane is well determined."""
+    steps = [
+        zonda.PointingDaisy(radius="3 arcmin", speed="50 arcsec/s", scan_duration="60 s"),
+        zonda.SkyMap(file=CLUSTER, centre="target"),
+        zonda.WhiteNoise(),
+        zonda.Efficiency(),
+        zonda.MaximumLikelihoodMap(pixel="8 arcsec", half_difference=False, modes=0, free=0),
+    ]
+    deviates = []
+    for seed in range(60):
+        data = zonda.Pipeline(steps, runs=RUNS).run(zonda.Scene(**{**SCENE, "seed": seed}))
+        amplitude, error = matched(data["model/map"], data["free/map"])
+        deviates.append(amplitude / error)
+    # 60 deviates: their rms to 1 / sqrt(120), and baselines that are found a little too noisy
+    assert np.sqrt(np.mean(np.square(deviates))) == pytest.approx(1, abs=3 / np.sqrt(120))
+
+
 def test_the_figure(found):
     t, m = found["model/map"], found["map"]
     amplitude, error = matched(t, m)
