@@ -9,18 +9,24 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from zonda.core.configuration.input_paths import InputPath
-from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Seconds
+from zonda.core.numerics.projection import boresights
 from zonda.core.observation import Observation
 
 from .parameters import MapParameters
+
+SHORTEST, LONGEST, PART = 0.05, 0.2, 0.15
+"""Of a baseline, s, where none is given; share of the time in which the focal plane is crossed."""
+INSTANTS = 1000
+"""Of a scan at which its speed is looked at."""
 
 
 class LikelihoodParameters(MapParameters):
     """Noise model, iteration, and what is taken off."""
 
-    baseline: Seconds = quantity("0.2 s", gt=0)
-    """Length of a baseline: noise is white within it, but for the free modes."""
+    baseline: Seconds | None = Field(None, gt=0, examples=["0.2 s"])
+    """Length of a baseline: noise is white within it, but for the free modes. Where absent, 0.15
+    of the time in which the scan crosses the focal plane, from 0.05 to 0.2 s."""
     modes: int = Field(3, ge=0, le=20)
     """Modes that detectors share, each with a spectrum of its own. 0: baselines of independent
     detectors (destriping with a noise prior)."""
@@ -77,6 +83,20 @@ class LikelihoodParameters(MapParameters):
         if self.undetermined == "plane" and self.kind != "TAN":
             raise ValueError("undetermined: plane is for TAN images; choose none or mean")
         return self
+
+    def baseline_of(self, observation: Observation) -> float:
+        """Length of a baseline, s: modes that are not free change while the focal plane is crossed,
+        at the median speed of the boresight.
+        """
+        if self.baseline is not None:
+            return self.baseline
+        some = np.arange(0, observation.n_samples - 1, max(observation.n_samples // INSTANTS, 1))
+        one, other = (boresights(observation.boresight_radec[some + k]) for k in (0, 1))
+        speed = observation.sample_rate * np.sqrt(((other - one) ** 2).sum(axis=0))
+        field = 2 * observation.focalplane.radius + observation.instrument.beam_fwhm
+        middle = float(np.median(speed)) if some.size else 0.0
+        crossed = min(max(PART * field / middle, SHORTEST), LONGEST) if middle > 0 else LONGEST
+        return max(crossed, 4 / observation.sample_rate)
 
     def groups_of(self, observation: Observation) -> NDArray[np.intp]:
         """(n_det,) number of the group of each detector."""

@@ -88,24 +88,24 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
 
     def _length(self, observation: Observation) -> int:
         """Samples of a baseline. Raises PipelineError for too few or too short baselines."""
-        length = max(round(self.baseline * observation.sample_rate), 1)
+        seconds = self.baseline_of(observation)
+        length = max(round(seconds * observation.sample_rate), 1)
         place = f"{self.label}, {observation.name}"
         if length < 2:
             raise PipelineError(
-                f"a baseline of {self.baseline:g} s has one sample, at"
-                f" {observation.sample_rate:g} Hz",
+                f"a baseline of {seconds:.3g} s has one sample, at {observation.sample_rate:g} Hz",
                 place=place,
                 cure=f"set baseline: {4 / observation.sample_rate:.2g} s, or longer",
             )
-        self._need_baselines(-(-observation.n_samples // length), place)
+        self._need_baselines(-(-observation.n_samples // length), seconds, place)
         return length
 
-    def _need_baselines(self, number: int, place: str) -> None:
+    def _need_baselines(self, number: int, seconds: float, place: str) -> None:
         needed = SHORTEST + self.trend
         if number < needed:
             raise PipelineError(
-                f"the scan has samples in {number} baselines of {self.baseline:g} s, too few to"
-                " find its noise from",
+                f"the scan has samples in {number} baselines of {seconds:.3g} s, too few to find"
+                " its noise from",
                 place=place,
                 cure=f"set a shorter baseline, of which a scan has {needed} or more;"
                 " or make the map with BinMap",
@@ -134,7 +134,8 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         scan.compress(stream, self.label)
         observation, white = stream.observation, scan.white(self.label)
         place = f"{self.label}, {observation.name}"
-        self._need_baselines(int(np.count_nonzero(scan.found.counted.any(axis=0))), place)
+        number = int(np.count_nonzero(scan.found.counted.any(axis=0)))
+        self._need_baselines(number, self.baseline_of(stream.observation), place)
         for _ in range(WHITE_LEVELS):
             scan.noise = scan.estimate(white, self)
             white = np.where(scan.noise.fast < STEADY, white * scan.noise.fast, white)
@@ -171,6 +172,8 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         data.partial[self.label].unknown_variance = False  # type: ignore[attr-defined]
         data.add(f"{self.label} scans", CompressedScans([state.compressed()]))
         log, noise = observation.log, state.noise
+        seconds = state.length / observation.sample_rate
+        log.state(self.label, "length of a baseline", f"{seconds:.3g} s, {state.length} samples")
         lost = observation.n_samples % state.length
         if lost:
             log.state(self.label, "samples of the last baseline, which is shorter", str(lost))

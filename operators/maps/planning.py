@@ -15,6 +15,7 @@ from zonda.core.plan.planning import Planning, samples_in
 from .bin_map import BinMap
 from .coverage import COUNTS
 from .grid import in_frame
+from .likelihood_parameters import LONGEST
 from .map_layout import MapLayout
 from .maximum_likelihood import SHORTEST, MaximumLikelihoodMap
 
@@ -112,7 +113,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """
         step, signals = self.operator, len(observation.signals)
         samples, instants = step._samples
-        baselines = samples / max(step.baseline * observation.sample_rate, 1)
+        baselines = samples / self.length(observation)
         free = 8 * signals * self.free(observation) * instants
         runs = samples * self.runs(observation) + self.gaps(observation)
         return int(self.of_run * runs + (12 + 8 * signals) * baselines + free)
@@ -152,8 +153,11 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
 
     def baselines(self, observation: Observation) -> float:
         """Baselines of all detectors in a scan."""
-        length = max(self.operator.baseline * observation.sample_rate, 1)
-        return observation.n_detectors * observation.n_samples / length
+        return observation.n_detectors * observation.n_samples / self.length(observation)
+
+    def length(self, observation: Observation) -> float:
+        """Samples of a baseline."""
+        return max(self.operator.baseline_of(observation) * observation.sample_rate, 1)
 
     @property
     def polarized(self) -> bool:
@@ -164,18 +168,17 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """Runs per sample: the boresight crosses 4 / pi pixels for each pixel of its way, and runs
         end with baselines.
         """
-        step = self.operator
         if observation.hwp_angle is not None:
             return 1.0
         forward = np.diff(boresights(observation.boresight_radec), axis=1)
         way = float(np.sqrt((forward**2).sum(axis=0)).mean()) if forward.size else 0.0
         crossed = 4 / math.pi * way / (self.traits(observation).pixel or way or 1.0)
-        return min(1.0, 1.1 * crossed + 1 / max(step.baseline * observation.sample_rate, 1))
+        return min(1.0, 1.1 * crossed + 1 / self.length(observation))
 
     @property
     def shortest(self) -> float:
         """One that its noise is found from, and a baseline more, s."""
-        return self.operator.baseline * (SHORTEST + self.operator.trend + 1)
+        return (self.operator.baseline or LONGEST) * (SHORTEST + self.operator.trend + 1)
 
     def states(self, observations: Sequence[Observation]) -> list[str]:
         """Readings, the size of the compressed scans, and solutions."""
@@ -184,7 +187,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         return [
             "each scan is read twice: for runs, baselines and noise; for sums and free modes",
             f"compressed scans take {size / 1e9:.3g} GB, at {runs:.2g} runs a sample"
-            f" ({self.of_run} bytes each) and baselines of {step.baseline:g} s",
+            f" ({self.of_run} bytes each) and baselines of {step.baseline_of(longest):.3g} s",
             f"{self._solutions(longest)} solutions by conjugate gradients, {step.refine} of them"
             " for the noise",
         ]

@@ -12,6 +12,7 @@ import zonda
 import zonda.pipelines
 from zonda.core.data import Data
 from zonda.core.errors import PipelineError
+from zonda.core.numerics.projection import boresights
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.registry import operators_that
 from zonda.operators.maps.bin_map import BinMap
@@ -519,6 +520,20 @@ def test_a_load_of_each_detector_leaves_the_map_as_it_is():
     # noise is found from the same baselines to rounding, of 1e-16 of 3.6 K over 1e-3 K and of
     # fixed-point weights, 2^-30
     assert np.nanmax(np.abs(one.signal - two.signal)) < 1e-5 * np.nanmedian(one.noise)
+
+
+def test_baselines_follow_from_the_scan():
+    """Waves across the field pass while it is crossed: 0.15 of that time, from 0.05 to 0.2 s."""
+    step, o = MaximumLikelihoodMap(), observation()
+    turn = np.linalg.norm(np.diff(boresights(o.boresight_radec), axis=1), axis=0)
+    speed = np.median(turn) * o.sample_rate
+    for field in (0.3, 1.0, 3.0):  # times a speed of one second
+        o.focalplane.xi[:] = np.linspace(-0.5, 0.5, 37) * (field * speed - o.instrument.beam_fwhm)
+        o.focalplane.eta[:] = 0.0
+        expected = min(max(0.15 * field, 0.05), 0.2)
+        # speeds of 1000 instants of 6000
+        assert step.baseline_of(o) == pytest.approx(expected, rel=0.01)
+    assert MaximumLikelihoodMap(baseline="0.3 s").baseline_of(o) == 0.3
 
 
 def test_few_detectors_and_many_modes_keep_the_level_of_white_noise():
