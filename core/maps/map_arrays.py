@@ -302,7 +302,8 @@ class MapArrays:
             for name, plane in self.planes.items()
             if not plane.joint
         }
-        plain = replace(self, planes=planes)
+        taken = self.taken_off if which == "I" else ""
+        plain = replace(self, planes=planes, taken_off=taken)
         if which != "P":
             return plain
         p = np.hypot(found.q, found.u)

@@ -183,6 +183,8 @@ def draw_map(
     title, meaning = titles.get(signal, other)
     title, how = _named(title, key), _how(product, shown)
     text = f"{meaning} {how[0].upper()}{how[1:]}"
+    if product.taken_off:
+        text += f" Its {product.taken_off} is taken off: the data hardly determine it."
     head = _titled(title, shown)
     if snr is not None:
         head += f"; contours: S/N, {noise_text(snr[1], short=True)}"

@@ -15,6 +15,7 @@ from zonda.core.errors import PipelineError
 from zonda.core.numerics.projection import boresights
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.registry import operators_that
+from zonda.operators.diagnostics.plot_operators import draw_map
 from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.grid import Looking
 from zonda.operators.maps.maximum_likelihood import MaximumLikelihoodMap
@@ -336,6 +337,16 @@ def test_files_say_what_was_taken_off(how, taken, tmp_path):
     assert zonda.read_map(tmp_path / "m.fits").taken_off == found.taken_off == taken
     keys = fits.getheader(tmp_path / "m.fits", 0)
     assert keys.get("TAKENOFF", "") == taken
+    text = draw_map("map", "", "map", found, zonda.Plots())[0].caption
+    assert (f"Its {taken} is taken off" in text) == bool(taken)
+
+
+def test_what_was_taken_off_is_that_of_i():
+    o, rng = observation(polarized=True, plate=True), np.random.default_rng(9)
+    noise = SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    how = {"stokes": "IQU", "pixel": "30 arcsec", "refine": 0, "tolerance": 0.09}
+    found = mapped(o, noise, **how)
+    assert [found.stokes(k).taken_off for k in "IQUP"] == ["plane", "", "", ""]
 
 
 @pytest.mark.parametrize(
