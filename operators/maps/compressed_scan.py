@@ -102,8 +102,8 @@ class CompressedScan:
         y = np.empty(self.shape)
         modes = a if len(a) else np.zeros((1, len(y)))
         steps = np.zeros((len(modes), self.n_samples + 1))
-        for mode, row in zip(modes, steps, strict=True):
-            _see(*self._runs, np.ascontiguousarray(m), mode, y, row)
+        for k, (mode, row) in enumerate(zip(modes, steps, strict=True)):
+            _see(*self._runs, np.ascontiguousarray(m), mode, k > 0, y, row)
         return y, np.cumsum(steps[: len(a)], axis=1)[:, :-1]
 
     def spread(self, y: Floats, s: Floats, a: Floats, out: Floats) -> None:
@@ -113,7 +113,7 @@ class CompressedScan:
         np.cumsum(s, axis=1, out=running[: len(a), 1:])
         for k, (mode, row) in enumerate(zip(modes, running, strict=True)):
             own = np.zeros_like(y) if k else np.ascontiguousarray(y)
-            _spread(*self._runs, mode, own, row, out)
+            _spread(*self._runs, mode, k > 0, own, row, out)
 
     def about_means(self, s: Floats, y: Floats, a: Floats) -> Floats:
         """Equation (2) from s' = sum_d a_kd d_d(t) (k, n_samp) of the samples that count."""
@@ -403,14 +403,19 @@ def _step(steps, t, a, d, height):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _see(first, pixel, samples, angles, counted, m, a, y, steps):  # type: ignore[no-untyped-def]
-    """Equations (1) and (2) of a map, the latter as steps (n_samp + 1,) of one mode ``a`` (n_det,).
-    Indices without sign need no test for negative ones: twice as fast.
+def _see(  # type: ignore[no-untyped-def]
+    first, pixel, samples, angles, counted, m, a, further, y, steps
+):
+    """Equations (1) and (2) of a map, the latter as steps (n_samp + 1,) of one mode ``a`` (n_det,);
+    of a ``further`` mode, for the detectors that have a part in it. Indices without sign need no
+    test for negative ones: twice as fast.
     """
     n_det, n_base = counted.shape
     polarized, nowhere = angles.shape[1] > 0, np.uint64(m.shape[1])
     for d in range(n_det):
         w, t, before, lower = a[d], np.uint64(0), 0.0, 0.0
+        if further and w == 0.0:
+            continue
         for b in range(n_base):
             begin, end = first[d * n_base + b], first[d * n_base + b + 1]
             total, start = 0.0, t
@@ -441,13 +446,15 @@ def _see(first, pixel, samples, angles, counted, m, a, y, steps):  # type: ignor
 
 @kernel
 def _spread(  # type: ignore[no-untyped-def]
-    first, pixel, samples, angles, counted, a, y, running, m
+    first, pixel, samples, angles, counted, a, further, y, running, m
 ):
     """The adjoint of `_see`, from running sums (n_samp + 1,) of one mode."""
     n_det, n_base = counted.shape
     polarized, nowhere = angles.shape[1] > 0, np.uint64(m.shape[1])
     for d in range(n_det):
         w, t = a[d], np.uint64(0)
+        if further and w == 0.0:
+            continue
         for b in range(n_base):
             begin, end = first[d * n_base + b], first[d * n_base + b + 1]
             total, now = 0.0, t

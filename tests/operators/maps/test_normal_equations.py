@@ -91,7 +91,7 @@ def dense(pixel, noise):
     return without(whole, np.eye(pixel.size)[:, pixel.ravel() < 0])
 
 
-@pytest.mark.parametrize("free", [0, 1])
+@pytest.mark.parametrize("free", [0, 1, 2])
 @pytest.mark.parametrize("polarized", [False, True])
 @pytest.mark.parametrize("flagged", [False, True])
 def test_the_matrix_is_the_dense_one(flagged, polarized, free):
