@@ -105,14 +105,15 @@ class BaselineNoise:
         g = np.sqrt(self.white / self.length)[:, None]
         z = y / g
         take_lines(z, self.lines, counted)
-        found = fft.rfft(z, axis=1)
+        found = fft.rfft(z, axis=1, overwrite_x=True)
         bins = np.repeat(np.arange(len(self.own)), np.diff(self.edges))
         share = self.shared / (self.own[:, None] + self.shared)
         share[:, : self.free] = 1.0
         _weigh(found, 1 / self.own[bins], np.ascontiguousarray(share[bins].T), self.modes)
-        z = fft.irfft(found, y.shape[1], axis=1)
+        z = fft.irfft(found, y.shape[1], axis=1, overwrite_x=True)
         take_lines(z, self.lines, counted)
-        return np.asarray(z / g)
+        z /= g
+        return np.asarray(z)
 
 
 def estimate(

@@ -113,7 +113,7 @@ class CompressedScan:
         np.cumsum(s, axis=1, out=running[: len(a), 1:])
         for k, (mode, row) in enumerate(zip(modes, running, strict=True)):
             own = np.zeros_like(y) if k else np.ascontiguousarray(y)
-            _spread(*self._runs, mode, k > 0, own, row, out)
+            _spread(*self._runs, self.length, mode, k > 0, own, row, out)
 
     def about_means(self, s: Floats, y: Floats, a: Floats) -> Floats:
         """Equation (2) from s' = sum_d a_kd d_d(t) (k, n_samp) of the samples that count."""
@@ -446,23 +446,27 @@ def _see(  # type: ignore[no-untyped-def]
 
 @kernel
 def _spread(  # type: ignore[no-untyped-def]
-    first, pixel, samples, angles, counted, a, further, y, running, m
+    first, pixel, samples, angles, counted, length, a, further, y, running, m
 ):
     """The adjoint of `_see`, from running sums (n_samp + 1,) of one mode."""
     n_det, n_base = counted.shape
     polarized, nowhere = angles.shape[1] > 0, np.uint64(m.shape[1])
+    last = np.uint64(running.size - 1)
     for d in range(n_det):
         w, t = a[d], np.uint64(0)
         if further and w == 0.0:
             continue
         for b in range(n_base):
             begin, end = first[d * n_base + b], first[d * n_base + b + 1]
-            total, now = 0.0, t
-            for r in range(np.uint64(begin), np.uint64(end)):
-                then = now + np.uint64(samples[r])
-                if np.uint64(pixel[r]) < nowhere:
-                    total += running[then] - running[now]
-                now = then
+            then = min(t + np.uint64(length), last)
+            total, now = running[then] - running[t], t
+            if counted[d, b] < np.int64(then - t):
+                total = 0.0
+                for r in range(np.uint64(begin), np.uint64(end)):
+                    then = now + np.uint64(samples[r])
+                    if np.uint64(pixel[r]) < nowhere:
+                        total += running[then] - running[now]
+                    now = then
             mean = (y[d, b] - w * total) / counted[d, b] if counted[d, b] else 0.0
             for r in range(np.uint64(begin), np.uint64(end)):
                 p, then = np.uint64(pixel[r]), t + np.uint64(samples[r])

@@ -105,8 +105,10 @@ class WeighedScan(NamedTuple):
         """The last three terms of equation (1), (n_stokes, scan.width)."""
         scan, noise = self
         found = np.zeros((n_stokes, scan.width))
-        within = scan.counted / noise.white[:, None]
-        scan.spread(noise.weigh(y, scan.counted) - within * y, -s, noise.free_modes, found)
+        slow, within = noise.weigh(y, scan.counted), y / noise.white[:, None]
+        within *= scan.counted
+        slow -= within
+        scan.spread(slow, -s, noise.free_modes, found)
         return found
 
     def square(self, y: Floats, s: Floats) -> float:
