@@ -14,9 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import zonda
-from zonda.operators.maps import maximum_likelihood
-from zonda.operators.maps.baseline_noise import estimate
 from zonda.operators.maps.grid import HealpixGrid, Looking
+from zonda.operators.maps.likelihood_scan import LikelihoodScan
 
 from ..scenes import Marks, skip_without
 from .conftest import INSTRUMENT, SCAN, SCENE
@@ -36,6 +35,7 @@ import toast.templates
 from zonda.interop.toast import to_toast
 
 NSIDE = 128
+give_weights = LikelihoodScan.give_weights
 SKY = {
     "CTYPE1": "RA---TAN",
     "CTYPE2": "DEC--TAN",
@@ -192,11 +192,12 @@ def test_its_destriper_takes_1_over_f_noise_out_of_our_scans(recorded):
     assert left[1][0] < 1.1 * left[0][0]
 
 
-def without_a_prior(*arguments, **options):
-    """The noise of a scan whose baselines have no prior, of equal detectors."""
-    noise = estimate(*arguments, **options)
-    own = np.full_like(noise.own, 1e30)
-    return replace(noise, white=np.full_like(noise.white, np.median(noise.white)), own=own)
+def without_a_prior(scan, *arguments):
+    """Weights of a scan whose baselines have no prior, of equal detectors."""
+    noise = scan.noise
+    own, white = np.full_like(noise.own, 1e30), np.full_like(noise.white, np.median(noise.white))
+    scan.noise = replace(noise, white=white, own=own)
+    give_weights(scan, *arguments)
 
 
 def parts(observation, grid, length):
@@ -216,7 +217,7 @@ def parts(observation, grid, length):
 def test_a_destriped_map_is_that_of_its_offsets(recorded, monkeypatch):
     """Baselines of 1 s in the same samples, some of them flagged in part, without a prior of their
     amplitudes, in either; gaps of 3 s and less."""
-    monkeypatch.setattr(maximum_likelihood, "estimate", without_a_prior)
+    monkeypatch.setattr(LikelihoodScan, "give_weights", without_a_prior)
     maker = zonda.MaximumLikelihoodMap(
         nside=NSIDE,
         modes=0,
