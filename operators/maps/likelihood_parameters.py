@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,11 @@ INSTANTS = 1000
 class LikelihoodParameters(MapParameters):
     """Noise model, iteration, and what is taken off."""
 
+    largest_pixel: ClassVar[tuple[float, str]] = (
+        0.5,
+        "what varies within a pixel is taken for noise, and spread over the map (0.2 to 2 % of the"
+        " sky's rms at half of the beam, 7 % with modes: 0)",
+    )
     baseline: Seconds | None = Field(None, gt=0, examples=["0.2 s"])
     """Length of a baseline: noise is white within it, but for the free modes. Where absent, 0.15
     of the time in which the scan crosses the focal plane, from 0.05 to 0.2 s."""

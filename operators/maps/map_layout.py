@@ -106,14 +106,15 @@ class MapLayout:
     parameters: MapParameters
 
     def warn_of_pixels(self, observations: Sequence[Observation]) -> None:
-        """Warn of pixels that are larger than the beam."""
+        """Warn of pixels that are too large for the beam."""
         asked, beam = self.parameters, observations[0].instrument.beam_fwhm
+        most, effect = asked.largest_pixel
         side = math.sqrt(math.pi / 3) / asked.nside if asked.nside else asked.pixel
-        if 0 < beam < side:
+        if 0 < most * beam < side:
             pixel, fwhm, third = (f"{a / ARCSEC:.3g} arcsec" for a in (side, beam, beam / 3))
             cure = "raise nside" if asked.nside else f"choose pixel: {third} or less"
             text = f"{asked.label}: a pixel of {pixel} for a beam of {fwhm}"
-            warnings.warn(f"{text}: sources are averaged away; {cure}", stacklevel=1)
+            warnings.warn(f"{text}: {effect}; {cure}", stacklevel=1)
 
     def common(
         self,

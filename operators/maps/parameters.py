@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,9 @@ WIDEST_SMOOTH = 0.1
 
 class MapParameters(MapMaker):
     """Pixels, weights, noise and planes of a map."""
+
+    largest_pixel: ClassVar[tuple[float, str]] = 1.0, "sources are averaged away"
+    """Largest pixel without a warning, in beams, and what larger ones do."""
 
     pixel: Angle = quantity("2 arcsec", gt=0)
     """Side of a pixel."""

@@ -24,6 +24,7 @@ from zonda.operators.maps.bin_map import BinMap
 from zonda.operators.maps.intensity_kernel import VALUE, WEIGHT
 from zonda.operators.maps.map_layout import MapLayout
 from zonda.operators.maps.map_sums import MapSums
+from zonda.operators.maps.maximum_likelihood import MaximumLikelihoodMap
 
 ARCSEC = np.radians(1 / 3600)
 N_DET, N = 19, 4500
@@ -681,16 +682,18 @@ def test_pixels_far_from_the_centre_are_smaller_and_hold_less_of_a_beam():
 
 
 @pytest.mark.parametrize(
-    ("pixels", "words"),
+    ("maker", "words"),
     [
-        ({"pixel": "2 arcmin"}, "120 arcsec for a beam of 8.5 arcsec(.|\n)*2.83"),
-        ({"nside": 1024}, "nside"),
+        (BinMap(pixel="2 arcmin"), "120 arcsec for a beam of 8.5 arcsec(.|\n)*averaged(.|\n)*2.83"),
+        (BinMap(nside=1024), "nside"),
+        (MaximumLikelihoodMap(pixel="5 arcsec"), "5 arcsec for a beam(.|\n)*noise(.|\n)*2.83"),
     ],
 )
-def test_a_pixel_larger_than_the_beam_warns(bench, pixels, words):
+def test_a_pixel_that_is_too_large_for_the_beam_warns(bench, maker, words):
     observation = bench.observation(3, 50)
     with pytest.warns(UserWarning, match=words):
-        MapLayout(BinMap(**pixels)).common([observation], None)
+        MapLayout(maker).common([observation], None)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        MapLayout(BinMap(pixel="8 arcsec")).common([observation], None)
+        for fine in (BinMap(pixel="8 arcsec"), MaximumLikelihoodMap(pixel="4 arcsec")):
+            MapLayout(fine).common([observation], None)

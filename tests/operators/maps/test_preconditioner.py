@@ -1,5 +1,7 @@
 """Smooth patterns of the preconditioner against dense linear algebra, and iterations with them."""
 
+from dataclasses import replace
+
 import healpy
 import numpy as np
 import pytest
@@ -84,6 +86,18 @@ def test_few_iterations_make_the_map_of_least_squares():
     low = np.linalg.eigvalsh(matrix / np.outer(root, root))
     determined = low[low > 1e-8]
     assert determined[0] <= other.ritz[0] < 1.5 * determined[0]
+
+
+def test_bits_do_not_depend_on_threads():
+    sky = np.random.default_rng(7).normal(size=(1, GRID.n_pixels))
+    found = []
+    for threads in (1, 2):
+        system = replace(survey(), threads=threads)
+        found.append(system.solve(system.apply(sky), 1e-7, 500))
+    one, two = found
+    assert one.smooth is not None
+    np.testing.assert_array_equal(one.values, two.values)
+    assert one.history == two.history
 
 
 def test_an_easy_map_needs_no_patterns():
