@@ -55,6 +55,8 @@ class Data:
     """The `Pipeline` that made all of it; None where several runs did."""
     threads: int = 1
     """Threads that the run may use."""
+    files: Any = field(default=None, repr=False)
+    """`core.run.streams.Files`, for arrays of products that do not fit in memory; None: all fit."""
     band: str = ""
     """Name of the band that these are the data of, where the camera has several."""
     bands: dict[str, Data] = field(default_factory=dict, repr=False)
@@ -147,6 +149,7 @@ class Data:
                 provenance=dict(self.provenance),
                 output=self.output,
                 threads=self.threads,
+                files=self.files,
                 laid_out=self.laid_out,
                 band=name,
             )

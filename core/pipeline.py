@@ -19,11 +19,16 @@ from .data import Data
 from .errors import PipelineError
 from .faults import faults_named
 from .hooks import manager
-from .machine import available_memory, available_threads, give_back_memory
+from .machine import (
+    available_memory,
+    available_threads,
+    give_back_memory,
+    resident_memory,
+)
 from .observation import Observation
 from .operator import Operator, labels
 from .output import Output
-from .run.budget import check_end, least_memory
+from .run.budget import check_end, files_of, least_memory
 from .run.execution import execute
 from .run.settings import Settings, Timer
 from .run.views import Band, View
@@ -346,6 +351,8 @@ class Pipeline:
             place=self.name,
         )
         data.threads = settings.threads
+        budget = settings.process or resident_memory() + available_memory() // 2
+        data.files = files_of(budget)
         return data, settings
 
     def _execute(self, bands: Sequence[Band], settings: Settings, timer: Timer) -> None:

@@ -26,6 +26,9 @@ class Product(ABC):
     kinds: ClassVar[dict[str, type[Product]]] = {}
     """Imported classes of products, by `identity`."""
 
+    in_files: ClassVar[bool] = False
+    """Its arrays may be in files, memory-mapped, where those of a campaign do not fit in memory."""
+
     signals: tuple[str, ...] = ()
     """Streams of the signals that it holds (`core.signal`), the complete one first; empty: it is of
     no signal in particular.

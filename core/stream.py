@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from .block import Block
@@ -177,8 +178,8 @@ def in_order(
                 future.cancel()
 
 
-def forget_pages(array: AnyFloats) -> None:
-    """Take the pages of a spilled stream out of this process's memory; the file keeps them."""
+def forget_pages(array: NDArray[Any]) -> None:
+    """Take the pages of an array in a file out of this process's memory; the file keeps them."""
     pages = getattr(array, "_mmap", None)
     if pages is not None and hasattr(mmap, "MADV_DONTNEED"):
         pages.madvise(mmap.MADV_DONTNEED)

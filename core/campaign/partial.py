@@ -18,6 +18,7 @@ from ..focalplane import Focalplane
 from ..log import Log
 from ..observation import Observation
 from ..product import Product
+from ..run.streams import Files
 from ..scene import Scene
 from . import trees
 
@@ -112,8 +113,10 @@ class Partial:
         trees.write(path, identity, tree, made)
 
     @classmethod
-    def read(cls, path: Path, identity: str) -> Partial:
-        """Read it from a file. Raises `InputError` where that is missing or damaged."""
+    def read(cls, path: Path, identity: str, files: Files | None = None) -> Partial:
+        """Read it from a file; ``files``: for products that may be there. Raises `InputError` where
+        that is missing or damaged.
+        """
         tree = trees.read(path, identity)
         products = {}
         for label, product in tree["products"].items():
@@ -124,7 +127,8 @@ class Partial:
                     place=str(path),
                     cure="import the class in the module of the step that makes it",
                 )
-            products[label] = kind.of(product["arrays"])
+            arrays = product["arrays"]
+            products[label] = kind.of(files.put(arrays) if files and kind.in_files else arrays)
         return cls(products, _log_of(tree["tally"]), tree["scans"])
 
     def observations(self, scene: Scene) -> list[Observation]:

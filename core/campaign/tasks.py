@@ -31,7 +31,9 @@ from ..experiment.experiment import Lost, Work
 from ..experiment.variant import Variant
 from ..faults import faults_named
 from ..figures import Figures
+from ..machine import available_memory, available_threads
 from ..pipeline import Part
+from ..run.streams import Files
 from ..storage.files import check_output_folder, discard
 from ..storage.written import recording
 from . import machines, trees
@@ -179,9 +181,9 @@ class Combined:
     figures: tuple[tuple[Any, ...], ...] = ()
 
 
-def combine(folder: Path, number: int) -> Combined:
+def combine(folder: Path, number: int, threads: int | None = None) -> Combined:
     """Add up one combination's partial products, finish its products and write them."""
-    data = combined(Job.read(folder), folder, number)
+    data = combined(Job.read(folder), folder, number, threads)
     counts = {(who, what) for who, what, _ in data.log.counts()}
     measured = [product for product in data.products.values() if isinstance(product, Figures)]
     return Combined(
@@ -191,7 +193,7 @@ def combine(folder: Path, number: int) -> Combined:
 
 
 @faults_named()
-def combined(job: Job, folder: Path, number: int) -> Data:
+def combined(job: Job, folder: Path, number: int, threads: int | None = None) -> Data:
     """Finished data of `combine`. Raises `InputError` if a partial product is missing or
     damaged.
     """
@@ -200,6 +202,7 @@ def combined(job: Job, folder: Path, number: int) -> Data:
     file = pipeline_of(job.pipelines[first.pipeline], folder)
     pipeline, scene = file.pipeline(), first.scene(file)
     data = Data(scene, output=check_output_folder(folder / combination.folder))
+    data.threads = threads or available_threads()
     data.provenance = {
         **pipeline.provenance(scene),
         "resolved_yaml": job.source[0] if len(job.source) == 1 else job.pipelines[first.pipeline],
@@ -212,7 +215,9 @@ def combined(job: Job, folder: Path, number: int) -> Data:
     depth = 1
     while FAN**depth < len(tasks):
         depth += 1
-    whole = _sum(tasks, folder, 0, depth)
+    size = sum(path.stat().st_size for task in tasks if (path := task.path(folder)).exists())
+    files = Files(0) if size > available_memory() // 2 else None
+    whole = _sum(tasks, folder, 0, depth, files)
     data.partial, data.log = whole.products, whole.log
     data.observations = whole.observations(scene)
     with recording(folder, anew=False):
@@ -220,15 +225,21 @@ def combined(job: Job, folder: Path, number: int) -> Data:
     return data
 
 
-def _sum(tasks: Sequence[Task], folder: Path, first: int, level: int) -> Partial:
+def _sum(
+    tasks: Sequence[Task],
+    folder: Path,
+    first: int,
+    level: int,
+    files: Files | None,
+) -> Partial:
     """Sum of ``FAN**level`` partial products from the ``first`` on; each level holds one."""
     if level == 0:
         task = tasks[first]
-        return Partial.read(task.path(folder), task.key)
-    whole = _sum(tasks, folder, first, level - 1)
+        return Partial.read(task.path(folder), task.key, files)
+    whole = _sum(tasks, folder, first, level - 1, files)
     width = FAN ** (level - 1)
     for branch in range(first + width, min(first + FAN * width, len(tasks)), width):
-        whole += _sum(tasks, folder, branch, level - 1)
+        whole += _sum(tasks, folder, branch, level - 1, files)
     return whole
 
 
@@ -341,9 +352,9 @@ class Combinations(Work[int, Combined]):
         super().__init__(pool, str(record.folder), cure, retries)
         self.folder, self.job, self.record, self.result = record.folder, record.job, record, result
 
-    def call(self, item: int) -> tuple[Callable[..., Combined], Path, int]:
+    def call(self, item: int) -> tuple[Callable[..., Combined], Path, int, int | None]:
         """See `Work.call`."""
-        return combine, self.folder.resolve(), item
+        return combine, self.folder.resolve(), item, self.pool.threads
 
     def ended(self, item: int, result: Combined | Lost) -> bool:
         """Record that products are written, and remove their partial products."""

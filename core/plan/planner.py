@@ -16,6 +16,7 @@ from ..configuration.pipeline_file import PipelineFile
 from ..errors import ZondaError
 from ..machine import available_memory, available_threads
 from ..pipeline import Pipeline
+from ..run.budget import files_of
 from ..run.settings import Settings
 from .bounds import OTHER_MODES, Bound, Choice, Context, Effect, Estimate, add, exact, full
 from .decide import Decided, check_droppable, decide, limits, named
@@ -77,8 +78,9 @@ def plan(
     whole = [label for label in structure.operators if label in drop]
     remaining = _without(pipeline, structure, whole) if whole else structure
     names = [band.name for band in scene.instrument.bands] or [""]
-    threads = threads or available_threads()
-    bands = {name: _in_band(name, file, drop, structure, remaining, threads) for name in names}
+    threads, free = threads or available_threads(), memory or available_memory() // 2
+    run = {"threads": threads, "files": files_of(free)}
+    bands = {name: _in_band(name, file, drop, structure, remaining, run) for name in names}
     every = [d for band in bands.values() for d in band.decided]
     decided = decide(
         [band.decided for band in bands.values()],
@@ -90,7 +92,6 @@ def plan(
     )
     contexts = [band.context for band in bands.values()]
     dtype = np.float64 if pipeline.precision == "float64" else np.float32
-    free = memory or available_memory() // 2
     made = Plan(
         structure,
         {
@@ -108,13 +109,13 @@ def _in_band(
     drop: Sequence[str],
     structure: Structure,
     remaining: Structure,
-    threads: int,
+    run: Mapping[str, Any],
 ) -> PlanOfBand:
     """Effects in one band, all in full, and the budget. ``remaining``: the structure without the
     operators that are dropped as a whole.
     """
     pipeline = file.pipeline()
-    context = context_of(pipeline, file.scene(), structure, name, threads)
+    context = context_of(pipeline, file.scene(), structure, name, **run)
     joined = context.joined
     budget = limits(file.header.budget, context.map_noise, context.depth.sample)
     allowed = {m: v for m, v in budget.items() if m in context.metrics}
@@ -123,7 +124,7 @@ def _in_band(
     found.append(Decided("pipeline", _precision(pipeline.precision, context)))
     check_droppable(drop, found, [o.label for o in pipeline.operators])
     if whole := [label for label in structure.operators if label in drop]:
-        left = context_of(file.pipeline(), file.scene(), remaining, name, threads)
+        left = context_of(file.pipeline(), file.scene(), remaining, name, **run)
         found = [d for d in found if d.operator not in whole]
         found += [Decided(o, _everything_of(o, estimates, context, left)) for o in whole]
         context = left

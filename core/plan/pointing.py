@@ -8,6 +8,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,12 +64,12 @@ def observed(
     operators: Sequence[Operator],
     scene: Scene,
     band: str = "",
-    threads: int = 1,
+    **run: Any,
 ) -> Data:
     """Observations of the operators; of a camera of several bands those of this ``band``, its
-    detectors where they are in the whole camera.
+    detectors where they are in the whole camera. ``run``: threads and files of the run (`Data`).
     """
-    data = Data(scene=scene, threads=threads)
+    data = Data(scene=scene, **run)
     if band:
         for operator in filter(points, operators):
             operator.observe(data)
@@ -87,7 +88,7 @@ def context_of(
     scene: Scene,
     structure: Structure,
     band: str = "",
-    threads: int = 1,
+    **run: Any,
 ) -> Context:
     """Point the telescope and gather what the bounds need, of one band where the camera has
     several.
@@ -98,7 +99,7 @@ def context_of(
     reading = [o for o in operators if planning_of(o).reads_streams]
     readers = frozenset(o.label for o in reading)
     others = [o for o in operators if o.label not in readers and not isinstance(o, Output)]
-    data = observed(others, scene, band, threads)
+    data = observed(others, scene, band, **run)
     chain = chain_of(pipeline, structure)
     note_signals(data.observations, chain.components, chain.signals)
     shown = _some(data.observations)

@@ -19,6 +19,7 @@ from ..output import Output
 from ..plan.planning import planning_of
 from .schedule import Schedule, does_the_same, schedule
 from .settings import Ahead, Settings, megabytes
+from .streams import Files
 from .views import Band, View
 
 BASE = 240_000_000
@@ -31,6 +32,13 @@ BLOCKS = "blocks on 1 thread"
 KEPT = "kept streams"
 OTHERS = "maps of other bands"
 FEWER = "keep fewer streams, of fewer or shorter scans"
+
+
+def files_of(budget: int) -> Files:
+    """Files for products that take more than a quarter of what a process may hold, libraries
+    apart: streams take half, and products are copied when they are finished.
+    """
+    return Files(max(budget - BASE, 0) // 4)
 
 
 def at_end(views: Sequence[View], outputs: Sequence[Operator]) -> dict[str, int]:

@@ -16,7 +16,8 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,11 +26,15 @@ from ..data import Observation, Stream
 from ..errors import OutputError, PipelineError
 from ..numerics.chunks import empty
 from ..numerics.smooth import SmoothField
+from ..stream import forget_pages
 from ..types import AnyFloats
 from .settings import Settings
 
 DISK_SHARE = 0.9
 """Of the free disk that streams may take."""
+
+LEAST_FILE, AT_A_TIME = 1 << 16, 1 << 22
+"""Bytes of an array that is put into a file, and numbers that are written at a time."""
 
 
 class StreamMadeAgain(Stream):
@@ -160,12 +165,72 @@ class Store:
             finally:
                 os.close(handle)
         except OSError as error:
-            raise OutputError(
-                f"a stream of {size / 1e9:.3g} GB cannot be put there: {error.strerror or error}",
-                place=tempfile.gettempdir(),
-                cure="raise --memory, or point TMPDIR to a larger disk",
-            ) from error
+            raise _no_room(size, error) from error
         return np.memmap(path, dtype, "r+", shape=shape)
+
+
+@dataclass
+class Files:
+    """Arrays of products that do not fit in memory, in temporary files without a name: they are
+    gone with the last array in them, also if the process is killed.
+
+    Attributes
+    ----------
+    room
+        Bytes that products may still take in memory.
+    """
+
+    room: int
+
+    def needed(self, size: int, place: str, cure: str) -> bool:
+        """Tell whether ``size`` bytes of a product go into files; else they take their room.
+
+        Raises
+        ------
+        PipelineError
+            Where the disk has no room for them either; ``cure``: what lessens them.
+        """
+        if size <= self.room:
+            self.room -= size
+            return False
+        if size > (disk := free_disk()):
+            raise PipelineError(
+                f"{size / 1e9:.3g} GB fit neither in memory ({self.room / 1e9:.3g} GB) nor on the"
+                f" disk ({disk / 1e9:.3g} GB free in {tempfile.gettempdir()})",
+                place=place,
+                cure=f"{cure}, or point TMPDIR to a larger disk",
+            )
+        return True
+
+    def put(self, tree: Any) -> Any:
+        """A tree of mappings, lists and arrays with its larger arrays in files, memory-mapped.
+        Raises OutputError where the disk is full.
+        """
+        if isinstance(tree, Mapping):
+            return {key: self.put(value) for key, value in tree.items()}
+        if isinstance(tree, list | tuple):
+            return [self.put(value) for value in tree]
+        if not isinstance(tree, np.ndarray) or tree.nbytes < LEAST_FILE:
+            return tree
+        with tempfile.TemporaryFile(prefix="zonda-") as file:
+            try:
+                _reserve(file.fileno(), tree.nbytes)
+            except OSError as error:
+                raise _no_room(tree.nbytes, error) from error
+            array = np.memmap(file, tree.dtype, "r+", shape=tree.shape)
+        to, of = array.reshape(-1), tree.reshape(-1)
+        for start in range(0, of.size, AT_A_TIME):
+            to[start : start + AT_A_TIME] = of[start : start + AT_A_TIME]
+            forget_pages(array)
+        return array
+
+
+def _no_room(size: int, error: OSError) -> OutputError:
+    return OutputError(
+        f"{size / 1e9:.3g} GB cannot be put there: {error.strerror or error}",
+        place=tempfile.gettempdir(),
+        cure="raise --memory, or point TMPDIR to a larger disk",
+    )
 
 
 def _reserve(handle: int, size: int) -> None:

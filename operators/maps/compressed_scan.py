@@ -25,6 +25,7 @@ Runs end at baselines and at multiples of `TILE_SAMPLES`: they depend on no bloc
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,7 +33,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
+from zonda.core.numerics.chunks import chunks
+from zonda.core.stream import forget_pages
 from zonda.core.types import Floats
+
+PART = 1 << 25
+"""Bytes of runs in files that are worked on at a time."""
 
 
 @dataclass
@@ -99,11 +105,12 @@ class CompressedScan:
         """(Y m (n_det, n_base), S m (k, n_samp)) of a map m (1 or 3, width), equations (1) and
         (2); ``a`` (k, n_det).
         """
-        y = np.empty(self.shape)
+        y, m = np.empty(self.shape), np.ascontiguousarray(m)
         modes = a if len(a) else np.zeros((1, len(y)))
         steps = np.zeros((len(modes), self.n_samples + 1))
         for k, (mode, row) in enumerate(zip(modes, steps, strict=True)):
-            _see(*self._runs, np.ascontiguousarray(m), mode, k > 0, y, row)
+            for some, runs in self._parts():
+                _see(*runs, m, mode[some], k > 0, y[some], row)
         return y, np.cumsum(steps[: len(a)], axis=1)[:, :-1]
 
     def spread(self, y: Floats, s: Floats, a: Floats, out: Floats) -> None:
@@ -113,7 +120,8 @@ class CompressedScan:
         np.cumsum(s, axis=1, out=running[: len(a), 1:])
         for k, (mode, row) in enumerate(zip(modes, running, strict=True)):
             own = np.zeros_like(y) if k else np.ascontiguousarray(y)
-            _spread(*self._runs, self.length, mode, k > 0, own, row, out)
+            for some, runs in self._parts():
+                _spread(*runs, self.length, mode[some], k > 0, own[some], row, out)
 
     def about_means(self, s: Floats, y: Floats, a: Floats) -> Floats:
         """Equation (2) from s' = sum_d a_kd d_d(t) (k, n_samp) of the samples that count."""
@@ -125,7 +133,8 @@ class CompressedScan:
         """Add each detector's ``weight`` (n_det,) at its samples to the weights ``out`` (1 or 6,
         width) of I, or of I, Q and U: ii, iq, iu, qq, qu, uu.
         """
-        _weigh(*self._runs, weight, out)
+        for some, runs in self._parts():
+            _weigh(*runs, weight[some], out)
 
     def in_gaps(self, y: Floats) -> Floats:
         """(gaps,) of each gap its baseline's value of y (n_det, n_base)."""
@@ -133,9 +142,20 @@ class CompressedScan:
         _in_gaps(self.first, self.pixel, self.n_pixels, y, out)
         return out
 
-    @property
-    def _runs(self) -> tuple[Any, ...]:
-        return self.first, self.pixel, self.samples, self.angles, self.counted
+    def _parts(self) -> Iterator[tuple[slice, tuple[Any, ...]]]:
+        """Detectors and their runs, as kernels take them: all of them, or of runs in files some at
+        a time, whose pages are given back. Sums over detectors go on from part to part.
+        """
+        every = self.first, self.pixel, self.samples, self.angles, self.counted
+        n_det, n_base = self.shape
+        in_files = isinstance(self.pixel, np.memmap)
+        rows = max(PART * n_det // self.nbytes, 1) if in_files else max(n_det, 1)
+        first, pixel, samples, angles, counted = map(np.asarray, every)
+        for some in chunks(n_det, rows):
+            part = first[some.start * n_base : some.stop * n_base + 1]
+            yield some, (part, pixel, samples, angles, counted[some])
+            for array in every:
+                forget_pages(array)
 
 
 class RunsOfTiles:

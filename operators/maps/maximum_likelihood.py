@@ -22,6 +22,7 @@ from pydantic import PrivateAttr
 
 from zonda.core.data import Block, Data, Observation, Stream
 from zonda.core.errors import PipelineError
+from zonda.core.plan.planning import planning_of
 
 from .bin_map import BinMap
 from .binning import Weights
@@ -61,6 +62,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
 
     _samples: tuple[int, int] = PrivateAttr((0, 0))
     _at_once: int = PrivateAttr(1)
+    _in_files: bool = PrivateAttr(False)
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations, and count their samples and threads."""
@@ -68,6 +70,11 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         every = [(o.n_detectors * o.n_samples, o.n_samples) for o in data.observations]
         self._samples = sum(n for n, _ in every), sum(n for _, n in every)
         self._at_once = min(data.threads, len(every))
+        if data.files is not None and every:
+            planning: Any = planning_of(self)
+            longest = max(data.observations, key=lambda o: o.n_detectors * o.n_samples)
+            size, place = planning.compressed(longest), f"{self.label}, compressed scans"
+            self._in_files = data.files.needed(size, place, planning.smaller)
 
     def check(self, data: Data) -> list[str]:
         """See `BinMap.check`. Raises PipelineError for too few or too short baselines."""
@@ -170,7 +177,11 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         """Hand over sums in pixels, and the compressed scan."""
         super().collect(data, observation, state.prepared)
         data.partial[self.label].unknown_variance = False  # type: ignore[attr-defined]
-        data.add(f"{self.label} scans", CompressedScans([state.compressed()]))
+        scans = CompressedScans([state.compressed()])
+        if self._in_files:
+            scans = CompressedScans.of(data.files.put(scans.arrays()))
+            observation.log.state(self.label, "compressed scans", "in temporary files")
+        data.add(f"{self.label} scans", scans)
         log, noise = observation.log, state.noise
         seconds = state.length / observation.sample_rate
         log.state(self.label, "length of a baseline", f"{seconds:.3g} s, {state.length} samples")

@@ -26,13 +26,13 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.product import Product
-from zonda.core.stream import in_order
+from zonda.core.stream import forget_pages, in_order
 from zonda.core.types import Floats
 
 from .baseline_noise import BaselineNoise
@@ -59,6 +59,8 @@ class Compressed:
 
 class CompressedScans(Product):
     """Compressed scans, in their order."""
+
+    in_files: ClassVar[bool] = True
 
     def __init__(self, scans: list[Compressed]) -> None:
         self.scans = scans
@@ -320,7 +322,10 @@ class NormalEquations:
         def one(weighed: WeighedScan, what: Floats | tuple[Floats, Floats]) -> Floats:
             scan, noise = weighed
             y, s = what if isinstance(what, tuple) else scan.seen(what, noise.free_modes)
-            return weighed.spread(y, s, self.n_stokes)
+            found = weighed.spread(y, s, self.n_stokes)
+            for array in (y, s, scan.counted):  # in files they stay there
+                forget_pages(array)
+            return found
 
         total = np.zeros((self.n_stokes, self._ends[-1]))
         items = list(zip(self.scans, of, strict=True))

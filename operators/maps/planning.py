@@ -13,6 +13,7 @@ from zonda.core.plan.bounds import Traits
 from zonda.core.plan.planning import Planning, samples_in
 
 from .bin_map import BinMap
+from .compressed_scan import PART
 from .coverage import COUNTS
 from .grid import in_frame
 from .likelihood_parameters import LONGEST
@@ -94,7 +95,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
 
     of = MaximumLikelihoodMap
     operator: MaximumLikelihoodMap
-    smaller = "choose a larger pixel or a longer baseline"
+    smaller = "choose a larger pixel or a longer baseline, or shorter scans"
 
     def memory(self, observation: Observation) -> int:
         """The compressed scans; twice the runs of a scan while these are put in order, sums and
@@ -105,7 +106,9 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         own = self.of_run * samples * self.runs(observation)
         own += (60 + 8 * signals) * self.baselines(observation)
         own += 16 * signals * self.free(observation) * observation.n_samples
-        return super().memory(observation) + self.compressed(observation) + int(own) + COMPILED
+        if not self.operator._in_files:
+            own += self.compressed(observation)
+        return super().memory(observation) + int(own) + COMPILED
 
     def compressed(self, observation: Observation) -> int:
         """Bytes of all compressed scans: 6 r N + (12 + 8 n) N / L + 8 n k T for n signals and k
@@ -149,6 +152,8 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         product += 8 * stokes * (1 + step.patterns) * self.pixels
         most += int(8 * (12 * stokes + 2) * self.gaps(observation))
         scan = int(50 * self.baselines(observation)) + 32 * free * observation.n_samples
+        if self.operator._in_files:
+            scan += PART + 80 * int(self.baselines(observation))
         return most + 8 * maps * self.pixels + at_once * scan, product + COMPILED
 
     def baselines(self, observation: Observation) -> float:
@@ -184,9 +189,10 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """Readings, the size of the compressed scans, and solutions."""
         step, longest = self.operator, max(observations, key=lambda o: o.n_samples * o.n_detectors)
         size, runs = self.compressed(longest), self.runs(longest)
+        where = "in temporary files" if step._in_files else "in memory"
         return [
             "each scan is read twice: for runs, baselines and noise; for sums and free modes",
-            f"compressed scans take {size / 1e9:.3g} GB, at {runs:.2g} runs a sample"
+            f"compressed scans take {size / 1e9:.3g} GB {where}, at {runs:.2g} runs a sample"
             f" ({self.of_run} bytes each) and baselines of {step.baseline_of(longest):.3g} s",
             f"{self._solutions(longest)} solutions by conjugate gradients, {step.refine} of them"
             " for the noise",
