@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -55,6 +55,10 @@ class Data:
     """The `Pipeline` that made all of it; None where several runs did."""
     threads: int = 1
     """Threads that the run may use."""
+    progress: Callable[[int, int, str], None] = field(
+        default=lambda done, total, what: None, repr=False
+    )
+    """Called in `Operator.finalize` of long work: so many of ``total`` steps of it are done."""
     files: Any = field(default=None, repr=False)
     """`core.run.streams.Files`, for arrays of products that do not fit in memory; None: all fit."""
     band: str = ""
@@ -149,6 +153,7 @@ class Data:
                 provenance=dict(self.provenance),
                 output=self.output,
                 threads=self.threads,
+                progress=self.progress,
                 files=self.files,
                 laid_out=self.laid_out,
                 band=name,

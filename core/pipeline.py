@@ -350,7 +350,7 @@ class Pipeline:
             asked=memory is not None,
             place=self.name,
         )
-        data.threads = settings.threads
+        data.threads, data.progress = settings.threads, settings.progress
         budget = settings.process or resident_memory() + available_memory() // 2
         data.files = files_of(budget)
         return data, settings

@@ -16,7 +16,7 @@ from zonda.core.data import Data
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.planes import Plane
 from zonda.core.output import publish
-from zonda.core.signal import MAIN, Signal
+from zonda.core.signal import MAIN, Signal, product_name
 from zonda.core.types import Floats
 
 from .baseline_noise import estimate
@@ -212,7 +212,16 @@ class LikelihoodMaps(MapFromSums):
     ) -> Solution:
         """The solution for a signal, of all scans or of half of them."""
         right = self.right_side(equations, stream, half)
-        return equations.solve(right, self.parameters.tolerance, MOST_ITERATIONS)
+        step, told = self.parameters, [0]
+        what = product_name(stream, "map") if "equations" in vars(self) else "noise"
+        what += "" if half is None else f", half {half + 1}"
+
+        def tell(residual: float) -> None:
+            share = np.log(max(residual, step.tolerance)) / np.log(step.tolerance)
+            told[0] = max(told[0], int(100 * share))
+            self.data.progress(told[0], 100, f"{step.label}: iterations, {what}")
+
+        return equations.solve(right, step.tolerance, MOST_ITERATIONS, tell=tell)
 
     def right_side(
         self, equations: NormalEquations, stream: str, half: int | None = None

@@ -254,12 +254,18 @@ class NormalEquations:
         return times(self._wide, m) + self._added(parts)
 
     def solve(
-        self, right: Floats, tolerance: float, most: int, inverse: Floats | None = None
+        self,
+        right: Floats,
+        tolerance: float,
+        most: int,
+        inverse: Floats | None = None,
+        tell: Callable[[float], None] = lambda residual: None,
     ) -> Solution:
         """Conjugate gradients from 0, at most so many iterations: the map with the least residual.
         Behind it, and along patterns that the data do not determine, there is rounding alone.
 
         ``inverse``: of the weights of what is solved for, 0 elsewhere; None: map and gaps.
+        ``tell``: told the residual after each iteration, over that of the right side.
         """
         places, right = self.places if inverse is None else None, self._widened(right)
         weights = self._inverse if inverse is None else inverse
@@ -289,6 +295,7 @@ class NormalEquations:
             steps.append(step)
             turns.append(product / last)
             history.append(float(np.sqrt(max(product, 0.0) / first)))
+            tell(history[-1])
             if history[-1] == min(history[before:]):
                 best = m.copy()
             p, size = z + turns[-1] * p, product + turns[-1] ** 2 * size

@@ -17,6 +17,7 @@ from zonda.core.campaign import tasks
 from zonda.core.campaign.campaign_file import Job
 from zonda.core.configuration.pipeline_file import load
 from zonda.core.errors import PipelineError
+from zonda.core.hooks import manager
 from zonda.core.run import streams
 from zonda.core.run.streams import Files
 from zonda.operators.maps import compressed_scan
@@ -197,3 +198,28 @@ def test_a_signal_has_its_bits_without_others(ample, tmp_path):
     data = zonda.Pipeline(steps).run(file.scene(), threads=1, output=tmp_path / "out")
     data.products["quiet/map"] = ample[1].products["quiet/map"]
     assert digest(data) == ample[0]
+
+
+def test_iterations_show_their_progress(tmp_path):
+    """For the noise, both signals and their halves: shares of the way to the tolerance rise to all of it."""
+    seen = {}
+
+    class Hears:
+        @zonda.hookimpl
+        def zonda_progress(self, done, total, what):
+            if "iterations" in what:
+                seen.setdefault(what.partition(", ")[2], []).append(done / total)
+
+    plugin = Hears()
+    manager().register(plugin)
+    try:
+        run(tmp_path)
+    finally:
+        manager().unregister(plugin)
+    both = [
+        f"{name}{half}" for name in ("map", "quiet/map") for half in ("", ", half 1", ", half 2")
+    ]
+    assert list(seen) == ["noise", *both]
+    for shares in seen.values():
+        assert shares == sorted(shares)
+        assert shares[-1] == 1
