@@ -223,3 +223,18 @@ def test_iterations_show_their_progress(tmp_path):
     for shares in seen.values():
         assert shares == sorted(shares)
         assert shares[-1] == 1
+
+
+def test_realizations_are_draws_of_the_noise(tmp_path):
+    """`realizations` without co-adding: a map of other noise each, independent of the others."""
+    path, out = str(file_of(tmp_path, "{realizations: 3, combine: []}")), tmp_path / "out"
+    assert (
+        cli.main(["run", path, "--output", str(out), "--engine", "serial", "--threads", "1"]) == 0
+    )
+    maps = [zonda.read_map(p) for p in sorted(out.glob("*/map.fits"))]
+    assert len(maps) == 3
+    ok = np.all([m.known & (m.hits > 30) for m in maps], axis=0)
+    one, two, three = (m.signal[ok] for m in maps)
+    for a, b in ((one, two), (one, three), (two, three)):
+        # independent: correlations of n pixels scatter by n^-1/2; slow noise leaves fewer
+        assert abs(np.corrcoef(a, b)[0, 1]) < 0.3
