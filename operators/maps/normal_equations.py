@@ -230,7 +230,7 @@ class NormalEquations:
         for k, ((scan, noise), (y, _)) in enumerate(zip(self.scans, data, strict=True)):
             gaps = slice(self._ends[k], self._ends[k + 1])
             out[0, gaps] = scan.in_gaps(y / noise.white[:, None])
-        return out + self._added(data)
+        return out + self._added(data.__getitem__)
 
     def apply(self, m: Floats) -> Floats:
         """P^T Q P m, Q of the samples that count."""
@@ -250,8 +250,12 @@ class NormalEquations:
 
     def _product(self, m: Floats) -> Floats:
         """Left side of a map with gaps."""
-        parts = [self._part(m, k) for k in range(len(self.scans))]
-        return times(self._wide, m) + self._added(parts)
+
+        def seen(k: int) -> tuple[Floats, Floats]:
+            scan, noise = self.scans[k]
+            return scan.seen(self._part(m, k), noise.free_modes)
+
+        return times(self._wide, m) + self._added(seen)
 
     def solve(
         self,
@@ -321,22 +325,19 @@ class NormalEquations:
 
         return SmoothPatterns.of(self.places, self.weights[0], of_intensity)
 
-    def _added(self, of: Sequence[Floats | tuple[Floats, Floats]]) -> Floats:
-        """Last three terms of equation (1), added up in order: of a map, or of y and s of the data
-        of each scan.
-        """
+    def _added(self, of: Callable[[int], tuple[Floats, Floats]]) -> Floats:
+        """Last three terms of equation (1), added up in order, from y and s ``of`` scan k."""
 
-        def one(weighed: WeighedScan, what: Floats | tuple[Floats, Floats]) -> Floats:
-            scan, noise = weighed
-            y, s = what if isinstance(what, tuple) else scan.seen(what, noise.free_modes)
-            found = weighed.spread(y, s, self.n_stokes)
-            for array in (y, s, scan.counted):  # in files they stay there
+        def one(k: int) -> Floats:
+            y, s = of(k)
+            found = self.scans[k].spread(y, s, self.n_stokes)
+            for array in (y, s, self.scans[k].scan.counted):  # in files they stay there
                 forget_pages(array)
             return found
 
-        total = np.zeros((self.n_stokes, self._ends[-1]))
-        items = list(zip(self.scans, of, strict=True))
-        for k, part in enumerate(in_order(one, items, min(self.threads, len(items)))):
+        total, number = np.zeros((self.n_stokes, self._ends[-1])), len(self.scans)
+        parts = in_order(one, ((k,) for k in range(number)), min(self.threads, number))
+        for k, part in enumerate(parts):
             total[:, : self.n_pixels] += part[:, : self.n_pixels]
             total[:, self._ends[k] : self._ends[k + 1]] = part[:, self.n_pixels :]
         return total

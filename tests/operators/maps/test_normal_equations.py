@@ -1,5 +1,6 @@
 """Compressed scans and normal equations against dense linear algebra."""
 
+import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -202,6 +203,21 @@ def test_a_noiseless_sky_comes_back(flagged):
     seen = system.weights[0] > 0
     error = (m - sky)[seen]
     np.testing.assert_allclose(error - error.mean(), 0, atol=1e-6)
+
+
+def test_memory_does_not_grow_with_scans():
+    rng, wide = np.random.default_rng(10), 100_000
+    pixel = pointing(rng, False)
+    _, scan = compressed(rng.normal(size=pixel.shape), pixel)
+    scan.n_pixels = wide
+    one = WeighedScan(scan, noise_of(np.ones(N_DET), 1))
+    system, m = NormalEquations([one] * 30, 1, wide), rng.normal(size=(1, wide))
+    system.apply(m)
+    tracemalloc.start()
+    system.apply(m)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 10 * m.nbytes  # map, product, sum, and two of a scan; not 30
 
 
 def test_tiles_change_no_bit():
