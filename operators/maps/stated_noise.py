@@ -27,8 +27,11 @@ from zonda.core.types import Floats
 
 from .baseline_noise import SLOW, BaselineNoise, leading_of, members
 
-WAVES, ANGLES = 30, 12
+WAVES, ANGLES = 60, 12
 """Wave numbers across the focal plane, and directions of half a turn, isotropic in the mean."""
+EVEN = 1e-5
+"""Phase across the focal plane below which detectors see a wave alike: the gradients of longer
+waves have 1e-10 of their power, which is up to 1e9 times that of white noise."""
 
 
 def of_scene(
@@ -102,7 +105,7 @@ def _waves(
     plane = observation.focalplane
     xi, eta = plane.xi[rows] - plane.xi[rows].mean(), plane.eta[rows] - plane.eta[rows].mean()
     reach = max(float(np.hypot(xi, eta).max()), 1e-6)
-    edges = np.concatenate([[0.0], np.geomspace(0.05, 50, WAVES) / reach, [np.inf]])
+    edges = np.concatenate([[0.0], np.geomspace(EVEN, 50, WAVES) / reach, [np.inf]])
     number = np.concatenate([[0.0], np.sqrt(edges[1:-2] * edges[2:-1]), edges[-2:-1]])
     angle = np.pi * (np.arange(ANGLES) + 0.5) / ANGLES
     k = np.multiply.outer(number, np.stack([np.cos(angle), np.sin(angle)])).transpose(1, 0, 2)
