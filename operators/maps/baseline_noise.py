@@ -44,6 +44,8 @@ FILLS = 40
 """Steps of the fit that fills baselines: what is left falls by the share of them that lack."""
 ITERATIONS = 40
 """Products with the covariance in the search for its leading modes."""
+NOWHERE = np.zeros((2, 0))
+"""Places of detectors that are not known."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,8 @@ class BaselineNoise:
         (n_bins + 1,) first frequency of each bin, and the end.
     groups
         (n_det,) number of the group with which each detector has modes in common: of a wafer, or 0.
+    places
+        (2, n_det) of the detectors in the focal plane, rad; (2, 0) where they are not known.
     """
 
     white: Floats
@@ -94,6 +98,7 @@ class BaselineNoise:
     fast: Floats
     freedom: Floats
     groups: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    places: Floats = field(default_factory=lambda: NOWHERE)
 
     @property
     def free_modes(self) -> Floats:
@@ -129,6 +134,7 @@ def estimate(
     fixed: Floats | None = None,
     lacking: NDArray[np.bool_] | None = None,
     groups: NDArray[np.intp] | None = None,
+    places: Floats = NOWHERE,
 ) -> BaselineNoise:
     """Estimate the noise from baselines without a source, (n_det, n_base) [K].
 
@@ -150,6 +156,8 @@ def estimate(
         (n_det, n_base) baselines that were `filled`: they have no noise of their own.
     groups
         (n_det,) see `BaselineNoise`; None: all detectors are one.
+    places
+        (2, n_det) see `BaselineNoise`.
     """
     n_det, n_base = residual.shape
     seen_of_each = np.count_nonzero(counted, axis=1)[:, None]
@@ -166,7 +174,8 @@ def estimate(
     groups = np.zeros(n_det, np.intp) if groups is None else groups
     seen_in = [int(np.count_nonzero(seen_of_each[at])) for at in members(groups)]
     known = np.zeros((0, n_det)) if fixed is None else fixed
-    found = leading_of(groups, slow, [max(min(modes, n - 1), 0) for n in seen_in], known)
+    numbers = [max(min(modes, n - 1), 0) for n in seen_in]
+    found = leading_of(groups, slow, numbers, known, places)
     free, modes = sum(max(min(free, modes, n - 1), 0) for n in seen_in), len(found)
     seen = np.einsum("kd,dt->kt", found, slow)
     values = np.einsum("kt,kt->k", seen, seen) / max(top - 1, 1)
@@ -206,6 +215,7 @@ def estimate(
         np.where(edges[:-1] < (1 + LOWEST) / share, 0, 2 * np.diff(edges) * share)
         * max(n_seen - modes, 1),
         groups,
+        places,
     )
 
 
@@ -215,19 +225,42 @@ def members(groups: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 
 
 def leading_of(
-    groups: NDArray[np.intp], rows: Floats, numbers: Sequence[int], known: Floats
+    groups: NDArray[np.intp],
+    rows: Floats,
+    numbers: Sequence[int],
+    known: Floats,
+    places: Floats = NOWHERE,
 ) -> Floats:
     """`leading` vectors of each group, as many as its number, 0 for other detectors: the first of
     all groups, then the second of all ...; some are ``known`` (k, n_det).
+
+    Where `places` are known, the second and the third are the gradients of the first, if these hold
+    more.
     """
     found = []
     for number, at in zip(numbers, members(groups), strict=True):
         own = known[(known[:, at] != 0).any(axis=1)][:number, at]
+        if places.size and number > 2 > len(own):
+            own = with_gradients(rows[at], own, places[:, at])
         vectors = np.zeros((number, len(rows)))
         vectors[:, at] = leading(rows[at], number, own)
         found += list(enumerate(vectors))
     ordered = [vector for _, vector in sorted(found, key=itemgetter(0))]
     return np.array(ordered).reshape(-1, len(rows))
+
+
+def with_gradients(rows: Floats, known: Floats, places: Floats) -> Floats:
+    """The leading vector u of ``rows`` (n_det, n), and u x and u y of the detectors' ``places`` (2,
+    n_det): what long waves of the atmosphere make. Leading vectors that are found in the noise of
+    the streams miss these by so much that the atmosphere stays in the map. ``known`` (0 or 1,
+    n_det) alone where further leading vectors of one half of the columns hold more of the others.
+    """
+    first = leading(rows, 1, known)
+    middle = (first**2 * places).sum(axis=1, keepdims=True)
+    slopes = _orthonormal(np.concatenate([first, first * (places - middle)]), first)
+    others = leading(rows[:, ::2], 3, first)
+    power = [(np.einsum("kd,dt->kt", v[1:], rows[:, 1::2]) ** 2).sum() for v in (slopes, others)]
+    return slopes if power[0] > power[1] else known
 
 
 def filled(

@@ -191,6 +191,7 @@ class LikelihoodMaps(MapFromSums):
                     fixed=noise.modes[: noise.free],
                     lacking=scan.lacking,
                     groups=noise.groups,
+                    places=noise.places,
                 )
                 if step.noise != "estimated":
                     new = replace(new, own=noise.own)  # that of a table

@@ -157,7 +157,7 @@ class LikelihoodScan:
         what all see alike, then by the first mode that is found: a fit of more is not stable.
         """
         lacking, self.filler = self.scan.lacking, np.sqrt(1 / white / (1 / white).sum())
-        groups = step.groups_of(self.observation)[self.rows]
+        groups, plane = step.groups_of(self.observation)[self.rows], self.observation.focalplane
         for _ in range(FILLED):
             noise = estimate(
                 filled(self.found.means, lacking, white, self.filler, step.trend, groups),
@@ -170,6 +170,7 @@ class LikelihoodScan:
                 trend=step.trend,
                 lacking=lacking,
                 groups=groups,
+                places=np.stack([plane.xi, plane.eta])[:, self.rows],
             )
             before = self.filler
             if len(noise.modes):

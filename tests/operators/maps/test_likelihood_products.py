@@ -100,14 +100,14 @@ def test_chi_square_of_noise_from_the_model(scanned, how):
 
 
 def test_chi_square_of_wrong_models(scanned):
-    """Sources of 30 and 10 times the noise of a sample, in 1 % of the samples: within pixels as wide as
+    """Sources of 30 times the noise of a sample, in 1 % of the samples: within pixels as wide as
     the source and where it moves there is more than noise. What a walk that all detectors share adds
     to baselines is not that of independent ones."""
     o, noise, rest, moved = scanned
     walk = 2 * SIGMA * np.cumsum(np.random.default_rng(3).normal(size=o.n_samples))
     for signal, how in (
         (30 * SIGMA * rest, {"pixel": "40 arcsec"}),
-        (10 * SIGMA * moved, {"pixel": "6 arcsec"}),
+        (30 * SIGMA * moved, {"pixel": "6 arcsec"}),
         (walk, {"modes": 0, "free": 0}),
     ):
         value, error = chi2(o, signal + noise, **how)

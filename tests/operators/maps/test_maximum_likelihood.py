@@ -93,8 +93,9 @@ def test_the_sky_comes_back(taken):
     error = (found.signal - sky)[ok]
     error -= error.mean()
     centred = sky[ok] - sky[ok].mean()
-    # white noise alone leaves an error of 1 sigma / sqrt(sum sky^2 / noise^2): 0.3 %
-    assert (found.signal[ok] * centred).sum() / (centred**2).sum() == pytest.approx(1, abs=0.02)
+    # white noise alone leaves an error of 1 sigma / sqrt(sum sky^2 / noise^2): 0.3 %; all noise is up
+    # to 2.5 times as large
+    assert (found.signal[ok] * centred).sum() / (centred**2).sum() == pytest.approx(1, abs=0.025)
     # of 37 detectors one mode and a line of each are lost, and slow noise adds less than half
     # to white noise; where a plane stays in the map, noise fills it
     assert 0.9 < (error / found.noise[ok]).std() < (1.5 if taken == "plane" else 2.5)

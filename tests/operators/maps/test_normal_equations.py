@@ -6,7 +6,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from zonda.operators.maps.baseline_noise import BaselineNoise, estimate, leading, polynomials
+from zonda.operators.maps.baseline_noise import (
+    BaselineNoise,
+    estimate,
+    leading,
+    leading_of,
+    polynomials,
+)
 from zonda.operators.maps.compressed_scan import RunsOfTiles, Tile, add_baselines
 from zonda.operators.maps.normal_equations import NormalEquations, WeighedScan
 
@@ -270,3 +276,31 @@ def test_spectra_and_modes_are_found():
     assert (np.abs(own / expected - 1) < error + 0.03).all()
     error = 4 / np.sqrt(frequencies)
     assert (np.abs(shared / (1e4 * 0.1 / noise.frequency[at]) - 1) < error + 0.1).all()
+
+
+@pytest.mark.parametrize("other", [0.0, 1.0])
+def test_modes_are_gradients_unless_others_are_stronger(other):
+    """Of the atmosphere, white noise hides the gradients that a longer look would find. Its common
+    part is 1e4 times as strong as a gradient; patterns of a readout (columns of detectors) are
+    found where they are there.
+    """
+    rng = np.random.default_rng(11)
+    n_det, n = 80, 400
+    x, y = rng.uniform(-1, 1, (2, n_det))
+    columns = np.array([np.arange(n_det) % 4 == k for k in range(2)]) - 0.25
+    gain = rng.uniform(0.8, 1.2, n_det)
+    patterns = gain * np.stack([np.ones(n_det), 0.5 * x, 0.5 * y])
+    rows = np.array([1e4, 1.0, 1.0])[:, None, None] * patterns[:, :, None]
+    rows = (rows * rng.normal(size=(3, 1, n))).sum(axis=0)
+    rows += other * 3 * np.einsum("kd,kt->dt", columns, rng.normal(size=(2, n)))
+    rows += rng.normal(size=rows.shape)
+    groups, none = np.zeros(n_det, np.intp), np.zeros((0, n_det))
+    found = leading_of(groups, rows, [3], none, np.stack([x, y]))
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
+    axes = np.linalg.qr(np.concatenate([patterns[:1], columns if other else patterns[1:]]).T)[0]
+    # gradients: as exact as the gains, 1e-4 / sqrt(n); columns: n_det / n of an eigenvector's
+    # square over its power of 3^2 n_det / 5 is 1e-3
+    assert ((found @ axes) ** 2).sum(axis=1).min() > (0.98 if other else 1 - 1e-6)
+    if not other:
+        alone = leading_of(groups, rows, [3], none)
+        assert ((alone @ axes) ** 2).sum(axis=1).min() < 0.97
