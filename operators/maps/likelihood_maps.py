@@ -172,7 +172,7 @@ class LikelihoodMaps(MapFromSums):
         """Normal equations of all scans, with the noise of data minus the map."""
         found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
         step = self.parameters
-        for _ in range(step.refine if step.noise != "simulated" else 0):
+        for _ in range(step.refined):
             solution = self._solved(found, self.sums.first)
             scans = []
             for k, (one, (scan, noise)) in enumerate(

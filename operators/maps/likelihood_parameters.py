@@ -109,6 +109,11 @@ class LikelihoodParameters(MapParameters):
         return np.asarray(plane.wafer if self.group == "wafer" else 0 * plane.wafer, np.intp)
 
     @property
+    def refined(self) -> int:
+        """Solutions from which noise is estimated again; none if it is simulated."""
+        return 0 if self.noise == "simulated" else self.refine
+
+    @property
     def taken_off(self) -> Literal["none", "mean", "plane"]:
         """The name of the pattern that is taken off the map of I."""
         return self.undetermined or ("plane" if self.kind == "TAN" else "mean")

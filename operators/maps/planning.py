@@ -194,7 +194,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
             "each scan is read twice: for runs, baselines and noise; for sums and free modes",
             f"compressed scans take {size / 1e9:.3g} GB {where}, at {runs:.2g} runs a sample"
             f" ({self.of_run} bytes each) and baselines of {step.baseline_of(longest):.3g} s",
-            f"{self._solutions(longest)} solutions by conjugate gradients, {step.refine} of them"
+            f"{self._solutions(longest)} solutions by conjugate gradients, {step.refined} of them"
             " for the noise",
         ]
 
@@ -222,7 +222,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """Solutions over all samples; two halves are one."""
         step = self.operator
         signals = len({*observation.signals} - observation.unfiltered)
-        return step.refine + signals * (1 + bool(step.half_difference))
+        return step.refined + signals * (1 + bool(step.half_difference))
 
     def sweeps(self, observation: Observation) -> int:
         """One reading finds runs and baselines."""

@@ -41,10 +41,16 @@ def test_compressed_scans_are_as_large_as_planned(stokes, baseline):
 
 
 @pytest.mark.parametrize(
-    ("refine", "half", "solutions"), [(0, False, 1), (1, False, 2), (2, True, 4)]
+    ("how", "half", "solutions"),
+    [
+        ({"refine": 0}, False, 1),
+        ({}, False, 2),
+        ({"refine": 2}, True, 4),
+        ({"noise": "simulated"}, False, 1),
+    ],
 )
-def test_the_time_of_iterations_grows_with_the_samples(refine, half, solutions):
-    step = MaximumLikelihoodMap(pixel="10 arcsec", refine=refine, half_difference=half)
+def test_the_time_of_iterations_grows_with_the_samples(how, half, solutions):
+    step = MaximumLikelihoodMap(pixel="10 arcsec", half_difference=half, **how)
     short, long = scan(37, 3000), scan(37, 12000)
     part = Data(scene(short.instrument), [short])
     part.log.state(step.label, "iterations", "20")
