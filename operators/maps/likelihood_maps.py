@@ -21,7 +21,6 @@ from zonda.core.types import Floats
 
 from .baseline_noise import estimate
 from .intensity_kernel import VALUE
-from .likelihood_parameters import LikelihoodParameters
 from .map_from_sums import MapFromSums
 from .noise_record import NoiseRecord
 from .normal_equations import (
@@ -30,6 +29,7 @@ from .normal_equations import (
     Solution,
     WeighedScan,
 )
+from .parameters import LikelihoodParameters
 from .preconditioner import UNDETERMINED
 from .undetermined import undetermined
 

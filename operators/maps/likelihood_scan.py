@@ -20,10 +20,10 @@ from .bin_map import Prepared
 from .binning import Weights, binnings
 from .compressed_scan import RunsOfTiles, Tile, add_baselines
 from .intensity_kernel import VALUE, WEIGHT
-from .likelihood_parameters import LikelihoodParameters
 from .normal_equations import (
     Compressed,
 )
+from .parameters import LikelihoodParameters
 from .stated_noise import of_scene, of_table
 
 if TYPE_CHECKING:

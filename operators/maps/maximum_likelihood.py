@@ -27,12 +27,12 @@ from zonda.core.plan.planning import planning_of
 from .bin_map import BinMap
 from .binning import Weights
 from .likelihood_maps import LikelihoodMaps
-from .likelihood_parameters import LikelihoodParameters
 from .likelihood_scan import LikelihoodScan
 from .map_sums import MapSums
 from .normal_equations import (
     CompressedScans,
 )
+from .parameters import LikelihoodParameters
 
 if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable

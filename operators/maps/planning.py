@@ -16,9 +16,9 @@ from .bin_map import BinMap
 from .compressed_scan import PART
 from .coverage import COUNTS
 from .grid import in_frame
-from .likelihood_parameters import LONGEST
 from .map_layout import MapLayout
 from .maximum_likelihood import SHORTEST, MaximumLikelihoodMap
+from .parameters import LONGEST
 
 HEALPY = 32_000_000
 """Bytes of the library."""
