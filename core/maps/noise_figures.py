@@ -73,13 +73,13 @@ def noise_figures(maps: Mapping[str, MapProduct], given: float | None = None) ->
 
 
 def matched(template: MapProduct, product: MapProduct) -> tuple[float, float]:
-    """Amplitude of a template t in a map m of the same scans, and its standard error,
+    """Amplitude of a template t in a map m of the same step, and its standard error,
 
         a = (A t)^T m / t^T A t,   sigma = (t^T A t)^(-1/2).                                    (1)
 
     ``template``: maximum-likelihood map of a signal without noise, which has A t as a plane. 1 /
     sigma is its signal-to-noise ratio as a template. Raises InputError for one without, or without
-    power, and for maps of other samples or in another unit.
+    power, and for maps of other samples or noise models (filtered, smoothed), or in another unit.
     """
     if "template" not in template.planes:
         raise InputError(
@@ -88,11 +88,18 @@ def matched(template: MapProduct, product: MapProduct) -> tuple[float, float]:
             cure="take the maximum-likelihood map of a signal without noise, e.g. {only: [sky]},"
             " not smoothed",
         )
-    if not np.array_equal(template.hits, product.hits) or template.unit != product.unit:
+    same = all(
+        getattr(template, name) == getattr(product, name) for name in ("unit", "smoothed_by")
+    )
+    same = same and all(
+        np.array_equal(getattr(template, name), getattr(product, name), equal_nan=True)
+        for name in ("hits", "weights")
+    )
+    if not same:
         raise InputError(
-            "the map has other samples or another unit than the template",
+            "the map has other samples, another noise model, beam or unit than the template",
             place="template",
-            cure="take both maps from one run, with the same pixels, and in one unit",
+            cure="take both maps from one step of one run, not smoothed, and in one unit",
         )
     weights = np.nan_to_num(template.planes["template"].values)
     t, m = (np.nan_to_num(one.planes["signal"].values) for one in (template, product))

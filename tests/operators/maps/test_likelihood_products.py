@@ -201,6 +201,10 @@ def test_the_figure(found):
     assert (figure.value, figure.error) == (amplitude, error)
     with pytest.raises(InputError, match="maximum-likelihood map"):
         zonda.measure(found, "template_snr", map="binned")
+    for other in (found["binned"], m.smooth("9 arcsec")):  # of the same samples
+        np.testing.assert_array_equal(other.hits, t.hits)
+        with pytest.raises(InputError, match="another noise model"):
+            matched(t, other)
 
 
 def test_files_hold_it(found):
@@ -233,7 +237,7 @@ def test_what_is_no_template_is_refused(found):
     for wrong, other, cause in (
         (t.smooth("9 arcsec"), m, "no weights"),
         (m, m, "no weights"),
-        (t, m.to("mK_CMB"), "another unit"),
+        (t, m.to("mK_CMB"), "or unit"),
         (t, m.with_planes(hits=m.hits + 1), "other samples"),
         (t.with_planes(signal=0 * t.signal), m, "empty"),
     ):
