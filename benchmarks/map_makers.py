@@ -1,9 +1,9 @@
-"""Maximum-likelihood maps beside filter-and-bin on the same streams: transfer by scale, peak, noise,
-signal-to-noise ratio of the true source, CPU time of a reading and of an iteration.
+"""Maximum-likelihood maps beside filter-and-bin on the same streams: transfer by scale, peak,
+noise, signal-to-noise ratio of the true source, CPU time of an iteration.
 
     python benchmarks/map_makers.py m2                  # MUSTANG-2, two daisies of 8.6 min
-    python benchmarks/map_makers.py m2 --iterated 2 10  # and filter-and-bin, its map subtracted before
-    python benchmarks/map_makers.py m2 --templates 6    # and of the cluster in noise, so many seeds
+    python benchmarks/map_makers.py m2 --iterated 2 10  # and filter-and-bin that is iterated
+    python benchmarks/map_makers.py m2 --templates 6    # S/N of the cluster, over so many seeds
     python benchmarks/map_makers.py atlast              # AtLAST's reduced camera, a daisy of 20 s
     python benchmarks/map_makers.py survey              # constant-elevation scans, I, Q and U
 

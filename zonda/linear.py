@@ -367,10 +367,11 @@ def compressed(
 def noise_weight(
     scan: CompressedScan, noise: BaselineNoise, observation: Observation | None = None
 ) -> LinearOperator:
-    """Q of equation (4), symmetric: the inverse covariance of a scan's noise, with polynomials and
-    free modes of infinite variance, and samples that do not count too. Of streams of the good
-    detectors, (n_good n_samp)^2; given the
-    ``observation``, of all its detectors, of which the others weigh nothing.
+    """Q of equation (4), symmetric: the inverse covariance of a scan's noise. Polynomials, free
+    modes and samples that do not count have infinite variance.
+
+    It is of streams of the good detectors, (n_good n_samp)^2; given the ``observation``, of all its
+    detectors, of which the others weigh nothing.
 
     ``scan`` and ``noise`` are those of `compressed`. Raises InputError where the observation is
     another one.

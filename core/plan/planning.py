@@ -94,8 +94,6 @@ class Planning(Generic[O]):
         Bytes of its `memory`: for every observation, and for each detector and each sample of it.
     per_pixel
         Bytes that an output holds besides while it acts, for each pixel of the largest map.
-    shortest
-        Shortest scan that the step takes, s; a property, if it depends on the parameters.
     smaller
         Advice that lessens its `memory`, in a few words (``choose a larger pixel``), for a run that
         does not fit.
@@ -110,13 +108,6 @@ class Planning(Generic[O]):
     per_sample: ClassVar[int] = 0
     per_pixel: ClassVar[int] = 0
     smaller: ClassVar[str] = ""
-    if TYPE_CHECKING:
-
-        @property
-        def shortest(self) -> float: ...
-
-    else:
-        shortest: ClassVar[float] = 0.0
 
     def __init__(self, operator: O) -> None:
         self.operator = operator
@@ -184,6 +175,11 @@ class Planning(Generic[O]):
         samples.
         """
         return seconds, ""
+
+    @property
+    def shortest(self) -> float:
+        """Shortest scan that the step takes, s."""
+        return 0.0
 
     @property
     def pixels(self) -> int:

@@ -470,8 +470,7 @@ class TemplateSnr(_OfMap):
     """Signal-to-noise ratio of a source of known shape in a maximum-likelihood map, whose noise may
     be correlated in any way; or its amplitude in the map, equation (10).
 
-    The shape is the map of a signal without noise. What an amplitude between two scans of a survey
-    or between scales weighs is the noise model's.
+    The shape is the map of a signal without noise. Scans and scales are weighed by the noise model.
     """
 
     of: Literal["snr", "amplitude"] = "snr"
