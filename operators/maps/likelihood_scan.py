@@ -15,14 +15,12 @@ from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.signal import MAIN
 from zonda.core.types import AnyFloats, Floats
 
-from .baseline_noise import BaselineNoise, estimate, filled
+from .baseline_noise import BaselineNoise, estimate, filled, members
 from .bin_map import Prepared
 from .binning import Weights, binnings
 from .compressed_scan import RunsOfTiles, Tile, add_baselines
 from .intensity_kernel import VALUE, WEIGHT
-from .normal_equations import (
-    Compressed,
-)
+from .normal_equations import Compressed
 from .parameters import LikelihoodParameters
 from .stated_noise import of_scene, of_table
 
@@ -30,10 +28,10 @@ if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable
 
 FILLED, STILL = 60, 1e-6
-"""How often the mode that fills baselines is sought at most, and the change after which it stays.
-"""
+"""Searches at most for the mode that fills baselines, and the change below which they end."""
 MOST_APART = 1e4
-"""Ratio of variances of white noise, as found and by the NET: weights beyond it do not fit."""
+"""Largest ratio of the variances of white noise, as found and by the NET: fixed-point weights hold
+no more."""
 LOCK = threading.Lock()
 """Held while a thread adds to the sums of a scan."""
 
@@ -173,8 +171,9 @@ class LikelihoodScan:
                 places=np.stack([plane.xi, plane.eta])[:, self.rows],
             )
             before = self.filler
-            if len(noise.modes):
-                self.filler = noise.modes[: len(np.unique(groups))].sum(axis=0)
+            with_modes = [at for at in members(groups) if noise.modes[:, at].any()]
+            if with_modes:
+                self.filler = noise.modes[: len(with_modes)].sum(axis=0)
             if not lacking.any() or np.abs(self.filler - before).max() < STILL:
                 break
         return noise

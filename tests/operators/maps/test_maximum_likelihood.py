@@ -520,6 +520,26 @@ def test_wafers_have_modes_of_their_own(gaps):
         MaximumLikelihoodMap(group="all")
 
 
+def test_a_wafer_of_one_detector_fills_no_gap_of_others():
+    """Gaps are filled by the first mode of each wafer, of norm 1; that detector shares none."""
+    states = []
+
+    class Measured(MaximumLikelihoodMap):
+        def measure(self, stream, model=None):
+            states.append(super().measure(stream, model))
+            return states[-1]
+
+    o, rng = observation(), np.random.default_rng(19)
+    o.focalplane.wafer[:] = np.arange(37) % 2 + 1
+    o.focalplane.wafer[36] = 0
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(37, o.n_samples))
+    noise[::3, 2000:4000] = np.nan
+    run([Measured(pixel="30 arcsec", half_difference=False, group="wafer")], o, noise)
+    groups = o.focalplane.wafer
+    squares = [(states[0].filler[groups == k] ** 2).sum() for k in range(3)]
+    np.testing.assert_allclose(squares, [0, 1, 1], atol=1e-12)
+
+
 def test_a_load_of_each_detector_leaves_the_map_as_it_is():
     """The line of a detector is one over its gaps too: here most have some."""
     o, rng = observation(), np.random.default_rng(12)
