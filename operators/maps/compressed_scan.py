@@ -139,7 +139,8 @@ class CompressedScan:
     def in_gaps(self, y: Floats) -> Floats:
         """(gaps,) of each gap its baseline's value of y (n_det, n_base)."""
         out = np.empty(self.gaps)
-        _in_gaps(self.first, self.pixel, self.n_pixels, y, out)
+        for some, (first, pixel, *_) in self._parts() if self.gaps else ():
+            _in_gaps(first, pixel, self.n_pixels, y[some], out)
         return out
 
     def _parts(self) -> Iterator[tuple[slice, tuple[Any, ...]]]:

@@ -23,18 +23,13 @@ from .baseline_noise import estimate
 from .intensity_kernel import VALUE
 from .map_from_sums import MapFromSums
 from .noise_record import NoiseRecord
-from .normal_equations import (
-    CompressedScans,
-    NormalEquations,
-    Solution,
-    WeighedScan,
-)
+from .normal_equations import CompressedScans, NormalEquations, Solution, WeighedScan
 from .parameters import LikelihoodParameters
 from .preconditioner import UNDETERMINED
 from .undetermined import undetermined
 
 MOST_ITERATIONS = 1000
-"""Of conjugate gradients."""
+"""Iterations of conjugate gradients at most."""
 POOR = 1e-2
 """Ritz value of a pattern whose noise is ten times white noise."""
 
@@ -199,6 +194,11 @@ class LikelihoodMaps(MapFromSums):
             found = self._of(scans)
         return found
 
+    @cached_property
+    def _equations_of_halves(self) -> list[NormalEquations]:
+        """Normal equations of even and of odd scans, the same for all signals."""
+        return [self._of(self.equations.scans[half::2]) for half in range(2)]
+
     def _of(self, scans: Sequence[WeighedScan]) -> NormalEquations:
         n_stokes = 3 if self.sums.polarized else 1
         return NormalEquations(
@@ -235,7 +235,7 @@ class LikelihoodMaps(MapFromSums):
 
     def _half(self, stream: str, half: int, product: MapProduct) -> tuple[Floats, NormalEquations]:
         """The map of the even or odd scans, and their equations."""
-        equations = self._of(self.equations.scans[half::2])
+        equations = self._equations_of_halves[half]
         values = self._solved(equations, stream, half).values
         return self._determined(values, equations, product), equations
 
@@ -306,4 +306,4 @@ class LikelihoodMaps(MapFromSums):
                 )
         if step.taken_off != "none":
             log.state(label, "taken off the map of I", f"its weighted {step.taken_off}")
-        log.state(label, "noise of a pixel", "white noise alone, as found in the streams")
+        log.state(label, "noise of a pixel", "white noise alone, of the noise model")
