@@ -69,7 +69,7 @@ KNOTS = 160
 a Gaussian beam of 100 m that errs by 0.2 % where the power is 1e-4 of the largest, by 0.4 % at
 1e-6."""
 ACROSS = 300
-"""Nodes of the integral over q where it is cut by wave numbers: right to 2 %."""
+"""Nodes of the integral over q if it is split by wave number: an error of 2 %."""
 WAVE_NUMBERS = 640
 """As `KNOTS`, of one layer's spectrum along a line, which many speeds share. The error is that of
 `KNOTS` times (160 / 640)^2.

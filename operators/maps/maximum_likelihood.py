@@ -29,23 +29,21 @@ from .binning import Weights
 from .likelihood_maps import LikelihoodMaps
 from .likelihood_scan import LikelihoodScan
 from .map_sums import MapSums
-from .normal_equations import (
-    CompressedScans,
-)
+from .normal_equations import CompressedScans
 from .parameters import LikelihoodParameters
 
 if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable
 
 LEAST_POWER, FREEDOM = 0.2, 40
-"""Of slow baselines, in units of white noise: less is left where a filter has removed slow noise.
-It is found from so many degrees of freedom at least: white noise has less once in 1e8."""
-SHORTEST = 16
-"""Baselines of a scan."""
+"""Least power of slow baselines, in units of white noise, without a filter before the map; degrees
+of freedom from which it is measured. White noise alone has less once in 1e8."""
+FEWEST = 16
+"""Baselines that the noise of a scan is estimated from, at least."""
 STEADY, WHITE_LEVELS = 0.75, 3
-"""Where fast baselines have less than this share of the power that the scatter within them tells,
-modes that detectors share have a part in that scatter: what baselines tell is taken, and modes are
-sought again, so often at most."""
+"""Shared modes add to the scatter within baselines. A detector whose fast baselines have less than
+this share of the power that this scatter predicts gets the white level of its baselines, and modes
+are sought again, so many times at most."""
 
 
 class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
@@ -108,7 +106,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         return length
 
     def _need_baselines(self, number: int, seconds: float, place: str) -> None:
-        needed = SHORTEST + self.trend
+        needed = FEWEST + self.trend
         if number < needed:
             raise PipelineError(
                 f"the scan has samples in {number} baselines of {seconds:.3g} s, too few to find"
@@ -197,7 +195,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
             made.finish(data)
 
     def maps(self, data: Data) -> LikelihoodMaps | None:
-        """What the maps of the signals are made of; None where there is no scan."""
+        """Equations and sums for the maps of all signals; None where there is no scan."""
         self._spare.clear()
         sums: MapSums | None = data.take(self.label)
         scans: CompressedScans | None = data.take(f"{self.label} scans")

@@ -42,7 +42,8 @@ from .preconditioner import PATTERNS, UNDETERMINED, SmoothPatterns
 from .stokes_kernel import PLACES
 
 PATIENCE, RECENT = 25, 10
-"""Iterations before smooth patterns are thought of; those that tell how many are left."""
+"""Iterations before smooth patterns may be added; last ones from which the number of those that are
+left is predicted."""
 
 EXACT, MOST = 1e-10, 1000
 """Residual at which values of gaps for a given map are known, and iterations at most."""
@@ -367,7 +368,7 @@ def times(matrix: Floats, m: Floats) -> Floats:
 
 
 def takes_long(history: Sequence[float], tolerance: float) -> bool:
-    """True where the last iterations say that there are more left than `PATTERNS`."""
+    """True if, at the rate of the last iterations, more than `PATTERNS` are left."""
     if len(history) < PATIENCE:
         return False
     gained = np.log(history[-1 - RECENT] / history[-1])

@@ -17,7 +17,7 @@ from .compressed_scan import PART
 from .coverage import COUNTS
 from .grid import in_frame
 from .map_layout import MapLayout
-from .maximum_likelihood import SHORTEST, MaximumLikelihoodMap
+from .maximum_likelihood import FEWEST, MaximumLikelihoodMap
 from .parameters import LONGEST
 
 HEALPY = 32_000_000
@@ -182,8 +182,8 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
 
     @property
     def shortest(self) -> float:
-        """One that its noise is found from, and a baseline more, s."""
-        return (self.operator.baseline or LONGEST) * (SHORTEST + self.operator.trend + 1)
+        """Length from which noise can be estimated, and one more baseline, s."""
+        return (self.operator.baseline or LONGEST) * (FEWEST + self.operator.trend + 1)
 
     def states(self, observations: Sequence[Observation]) -> list[str]:
         """Readings, the size of the compressed scans, and solutions."""

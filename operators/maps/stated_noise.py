@@ -8,8 +8,8 @@ and the part of pink noise that all have in common. In equation (2) of `baseline
 
 q_1 is what all see alike (or each wafer), the mean emission of the atmosphere too; the others are
 the leading eigenvectors of S below `SLOW` beside it. The two ends of a scan of T seconds do not
-meet: this step of variance 2 int P df adds 4 int P df / T / (2 pi f)^2 to each spectrum P. That
-baselines average samples is left out; it matters where white noise is the larger.
+meet: this step of variance 2 int P df adds 4 int P df / T / (2 pi f)^2 to each spectrum P. The
+average over the samples of a baseline is neglected: it matters only where white noise is larger.
 """
 
 from __future__ import annotations
