@@ -163,7 +163,7 @@ class Filters(LinearOperator):
         return np.asarray(block.detdata[MAIN].ravel(), np.float64)
 
     def found(self, d: Floats) -> dict[str, Any]:
-        """By label, what the singular filters measure in a stream."""
+        """Modes that singular filters find in a stream, by label."""
         block, models = self._block(d), dict[str, Any]()
         for label, step, state in self.steps:
             if step.couples == "all":
@@ -172,7 +172,7 @@ class Filters(LinearOperator):
         return models
 
     def measured(self, block: Block, step: Operator, state: Any, model: Any = None) -> Any:
-        """What a singular filter measures in a stream, given its ``model``, or by itself."""
+        """State of a singular filter for a stream, with a given ``model`` or the stream's own."""
         signal = MAIN if model is None else stream_of("linear")
         array = block.detdata[MAIN]
         return step.measure(
@@ -203,7 +203,7 @@ class Filters(LinearOperator):
             )
 
     def _block(self, d: Floats) -> Block:
-        """All of a stream, a copy, as one block."""
+        """Copy of a whole stream as one block."""
         scan = self.observation
         if np.size(d) != self.shape[0]:
             text = f"a stream of {np.size(d)} samples for {scan.n_detectors} x {scan.n_samples}"
@@ -271,8 +271,8 @@ def filters(pipeline: Steps, observation: Observation, modes: Any = None) -> Fil
 
 
 def modes(pipeline: Steps, observation: Observation, stream: Floats) -> dict[str, Any]:
-    """What singular filters of a pipeline find in a stream (n_det, n_samp), K_RJ: by label, what
-    `filters` takes as ``modes``. Those before act on the stream as they do in a run. Detectors that
+    """Find the modes of singular filters in a stream (n_det, n_samp) [K_RJ], by label, as
+    `filters` takes them. Those before act on the stream as they do in a run. Detectors that
     they find dead have no part in the modes; the scan itself is not flagged.
     """
     return Filters(pipeline, observation, {}).found(stream)

@@ -90,7 +90,7 @@ def of_scene(
 
 
 def of_table(found: BaselineNoise, columns: Mapping[str, Floats]) -> BaselineNoise:
-    """What was ``found`` with the white levels of a table, with the detectors' own spectra of its
+    """Noise that was ``found``, with white levels of a table and the detectors' own spectra of its
     knees and slopes; the spectra of modes remain.
     """
     f = np.maximum(found.frequency, found.frequency[1] / 2)[:, None]
