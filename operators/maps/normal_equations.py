@@ -186,8 +186,10 @@ class NormalEquations:
         self.inverse = self._inverse[:, : self.n_pixels]
 
     def _part(self, m: Floats, k: int) -> Floats:
-        """Map and gaps of a scan, (rows, scan.width)."""
+        """Map and gaps of a scan, (rows, scan.width); a view where the scan has no gap."""
         gaps = slice(self._ends[k], self._ends[k + 1])
+        if gaps.start == gaps.stop:
+            return m[:, : self.n_pixels]
         return np.concatenate([m[:, : self.n_pixels], m[:, gaps]], axis=1)
 
     def _take(self, m: Floats, k: int, part: Floats) -> None:
