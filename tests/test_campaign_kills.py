@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ operators:
   - PinkNoise
   - Efficiency
   - SaveTOD: {{format: fits}}
+  - MaximumLikelihoodMap: {{pixel: 4 arcsec, product: deep}}
   - HighpassFilter
   - BinMap: {{pixel: 4 arcsec}}
   - SaveMap
@@ -164,17 +166,21 @@ def whole_run(place: Path, nursery: Nursery) -> tuple[dict[str, list[np.ndarray]
     assert status == 0, said
     found = products(place / "undisturbed")
     assert len([name for name in found if Path(name).name.startswith("tod")]) == TASKS_IN_ALL
-    assert "map.fits" in found
+    assert {"map.fits", "deep.fits", "noise_model_deep.ecsv"} <= found.keys()
     return found, time.monotonic() - begin
 
 
 @lru_cache(None)
 def numbers(path: Path, stamp: tuple[int, ...]) -> list[np.ndarray]:
-    """All numbers of a map or a scan; raises where the file is not whole. ``stamp``: says when it
-    is another one.
+    """All numbers of a map, a scan or a table; raises where the file is not whole. ``stamp``: says
+    when it is another one.
     """
     from astropy.io import fits
+    from astropy.table import Table
 
+    if path.suffix == ".ecsv":
+        table = Table.read(path, format="ascii.ecsv")
+        return [np.array(table[name]) for name in table.colnames]
     found: list[np.ndarray] = []
     with fits.open(path, memmap=False) as hdus:
         for hdu in hdus:
@@ -190,8 +196,12 @@ def numbers(path: Path, stamp: tuple[int, ...]) -> list[np.ndarray]:
 
 
 def products(folder: Path) -> dict[str, list[np.ndarray]]:
-    """Numbers in all finished maps and scans, by file name."""
-    paths = [p for p in sorted(folder.rglob("*.fits")) if not p.name.startswith(".")]
+    """Numbers in all finished maps, scans and tables, by file name."""
+    paths = [
+        p
+        for p in sorted(folder.rglob("*"))
+        if p.suffix in (".fits", ".ecsv") and not p.name.startswith(".")
+    ]
     stamps = [(s.st_ino, s.st_mtime_ns, s.st_size) for s in (p.stat() for p in paths)]
     return {
         p.relative_to(folder).as_posix(): numbers(p, stamp)
@@ -215,7 +225,7 @@ def check_whole(folder: Path) -> None:
     job = Job.read(folder) if (folder / FILE).exists() else None
     keys = {task.product: task.key for task in job.tasks} if job else {}
     for path in folder.rglob("*"):
-        if path.name.startswith(".") or path.suffix == ".fits" or not path.is_file():
+        if path.name.startswith(".") or path.suffix in (".fits", ".ecsv") or not path.is_file():
             continue  # hidden names are temporary files and the lock
         if path.parent.name == TASKS:
             if path.name in keys or path.name.startswith("layout"):
@@ -325,11 +335,14 @@ def workers_of(pid: int) -> list[int]:
 @pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds the workers in /proc")
 def test_workers_killed_at_random_moments(place: Path, nursery: Nursery, whole_run: Any) -> None:
-    """The campaign goes on without them; where they die too often it says so, and resumes."""
+    """The campaign goes on without them; where they die too often it says so, and resumes, with
+    another number of workers.
+    """
     expected, _ = whole_run
     moments, kills, name = random.Random(7), 0, "workers"
-    more = ["--engine", "processes", "--workers", "2"]
+    numbers_of_workers = cycle((3, 4, 1, 2))
     while kills < KILLS_OF_WORKERS or not (place / name / "map.fits").exists():
+        more = ["--engine", "processes", "--workers", str(next(numbers_of_workers))]
         arguments = (
             ["resume", name]
             if (place / name / FILE).exists()

@@ -184,7 +184,7 @@ def test_an_interrupted_campaign_has_the_bits_of_one_run(single, tmp_path, monke
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("workers", [2, 4])
+@pytest.mark.parametrize("workers", [1, 2, 3, 4])
 def test_workers_change_no_bit(single, tmp_path, workers):
     path, out = str(file_of(tmp_path, "{}")), tmp_path / "out"
     engine = ["--engine", "processes", "--workers", str(workers), "--no-prune"]
