@@ -63,6 +63,8 @@ class Data:
     """`core.run.streams.Files`, for arrays of products that do not fit in memory; None: all fit."""
     band: str = ""
     """Name of the band that these are the data of, where the camera has several."""
+    n_bands: int = 1
+    """Bands of the camera."""
     bands: dict[str, Data] = field(default_factory=dict, repr=False)
     """By name, the data of each band of a camera with several: its scans, and its products under
     the names that they have in a camera of one band.
@@ -157,6 +159,7 @@ class Data:
                 files=self.files,
                 laid_out=self.laid_out,
                 band=name,
+                n_bands=len(instrument.bands),
             )
             for name, camera in (instrument.cameras.items() if instrument.bands else ())
         }

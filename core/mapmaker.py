@@ -5,7 +5,7 @@ bands together, and the step that adds up what is calibrated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 
 from pydantic import PrivateAttr
 
@@ -14,6 +14,9 @@ from .numerics.smooth import FieldSums
 from .operator import Operator
 from .output import Output
 from .signal import MAIN, Component, is_stream
+
+if TYPE_CHECKING:
+    from .data import Data
 
 
 class MapMaker(Operator):
@@ -40,6 +43,14 @@ class MapMaker(Operator):
         `prepare` of its band's own copy of this step returned.
 
         Called in place of `exec` where the detectors of all bands look through the same pixels.
+        """
+        raise NotImplementedError
+
+    def finalize_bands(self, every: Sequence[Data]) -> None:
+        """Finish the products of all bands, given the data of each.
+
+        Called in place of `finalize` where the step measures all bands together (`joins`), when the
+        products of the first band are due.
         """
         raise NotImplementedError
 

@@ -25,6 +25,7 @@ from .machine import (
     give_back_memory,
     resident_memory,
 )
+from .mapmaker import MapMaker, joins
 from .observation import Observation
 from .operator import Operator, labels
 from .output import Output
@@ -387,7 +388,7 @@ class Pipeline:
     def _finish(self, data: Data, bands: Sequence[Band], timer: Timer) -> None:
         """Finish the products of all bands, and let the outputs act."""
         for band in bands:
-            self._make_products(band, timer)
+            self._make_products(band, bands, timer)
             if data.bands:
                 self._let_outputs_act(band.operators, band.data, timer)
         data.gather()
@@ -399,8 +400,10 @@ class Pipeline:
         data.provenance["timings"] = timer.rows()
         manager().hook.zonda_pipeline_end(pipeline=self, data=data)
 
-    def _make_products(self, band: Band, timer: Timer) -> None:
-        """Subtract the remainders, and finish all products."""
+    def _make_products(self, band: Band, bands: Sequence[Band], timer: Timer) -> None:
+        """Subtract the remainders, and finish all products; those of a map maker that joins bands
+        with the first one.
+        """
         data = band.data
         for name, parts in self.signals.remainders.items():
             for product in data.partial.values():
@@ -408,7 +411,10 @@ class Pipeline:
                     product.subtract(stream_of(name), [stream_of(part) for part in parts])
             data.log.state(name, "remainder", remainder(parts))
         for operator in band.chain.steps:
-            self._timed(timer, operator, "finalize", data)
+            if len(bands) == 1 or not (isinstance(operator, MapMaker) and joins(operator)):
+                self._timed(timer, operator, "finalize", data)
+            elif band is bands[0]:
+                self._timed(timer, operator, "finalize_bands", [one.data for one in bands])
 
     def _let_outputs_act(self, operators: Iterable[Operator], data: Data, timer: Timer) -> None:
         """Finish the outputs."""
@@ -421,15 +427,15 @@ class Pipeline:
         self,
         timer: Timer,
         operator: Operator,
-        stage: Literal["observe", "finalize"],
-        data: Data,
+        method: Literal["observe", "finalize", "finalize_bands"],
+        data: Data | list[Data],
     ) -> None:
         """Call an operator with all data and time it; hooks are called around ``finalize``."""
-        hooks = manager().hook
+        hooks, stage = manager().hook, method.removesuffix("_bands")
         if stage == "finalize":
             hooks.zonda_before_operator(operator=operator, observation=None, stage=stage)
         start = time.thread_time()
-        getattr(operator, stage)(data)
+        getattr(operator, method)(data)
         used = time.thread_time() - start
         timer.add(operator.label, stage, used)
         if stage == "finalize":

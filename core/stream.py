@@ -7,7 +7,7 @@ from __future__ import annotations
 import mmap
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -107,6 +107,8 @@ class Stream:
     """Components whose sum is the signal."""
     state: Any = None
     """Result of `Operator.prepare` of the step that measures it."""
+    states: Sequence[Any] = ()
+    """Those of each band, where the bands are measured together."""
 
     @property
     def shape(self) -> tuple[int, int]:

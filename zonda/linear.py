@@ -343,7 +343,7 @@ class _Unsolved(MaximumLikelihoodMap):
     """Equations of maximum-likelihood maps, in place of the maps."""
 
     def finalize(self, data: Data) -> None:
-        data.products["equations"] = self.maps(data)
+        (data.products["equations"],) = self.maps([data])
 
 
 def compressed(
@@ -357,10 +357,14 @@ def compressed(
     """
     own = {**dict(maker), "name": maker.label}
     step = _Unsolved.model_construct(maker.model_fields_set, **own)
-    of_band(data, band, "zonda.linear.compressed")
-    made: LikelihoodMaps = map_streams(data, [step])[f"equations_{band}" if band else "equations"]
-    right = made.equations.eliminated(made.right_side(made.equations, MAIN))
-    scans, noise = zip(*made.equations.scans, strict=True)
+    of_band(data, band, place := "zonda.linear.compressed")
+    if band and joins(step):
+        text = "the equations are those of all bands, and the map that of one"
+        raise PipelineError(text, place=place, cure="set group: band or wafer")
+    found: LikelihoodMaps = map_streams(data, [step])[f"equations_{band}" if band else "equations"]
+    made, equations = found.system, found.system.equations
+    right = equations.eliminated(made.right_side(equations, MAIN))
+    scans, noise = zip(*equations.scans, strict=True)
     return list(scans), list(noise), right.ravel()
 
 

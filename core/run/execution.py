@@ -476,7 +476,8 @@ class Execution:
 
             stream = WholeStream(stream, fields[name], lend)
         stream.signal, stream.components = held, signal.components
-        stream.state = views[0].states[step.label]
+        states = [view.states[step.label] for view in views]
+        stream.state, stream.states = states[0], states if len(states) > 1 else ()
         return stream
 
     def _make_again(

@@ -20,7 +20,7 @@ that of the noise itself makes the one of least noise.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from operator import itemgetter
 
@@ -104,6 +104,17 @@ class BaselineNoise:
     def free_modes(self) -> Floats:
         """(free, n_det) u / sigma, 1 / K: what makes streams of free modes."""
         return np.ascontiguousarray(self.modes[: self.free] / np.sqrt(self.white))
+
+    def of_some(self, rows: slice) -> BaselineNoise:
+        """The noise of some of the detectors."""
+        return replace(
+            self,
+            white=self.white[rows],
+            modes=self.modes[:, rows],
+            fast=self.fast[rows],
+            groups=self.groups[rows],
+            places=self.places[:, rows],
+        )
 
     def weigh(self, y: Floats, counted: NDArray[np.int32]) -> Floats:
         """Q_b y of baselines (n_det, n_base), of which so many samples are ``counted``."""

@@ -5,12 +5,14 @@ off them.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from zonda.core.data import Data
 from zonda.core.maps.map_product import MapProduct
@@ -20,13 +22,15 @@ from zonda.core.signal import MAIN, Signal, product_name
 from zonda.core.types import Floats
 
 from .baseline_noise import estimate
+from .grid import Grid
 from .intensity_kernel import VALUE
 from .map_from_sums import MapFromSums
+from .map_sums import MapSums
 from .noise_record import NoiseRecord
 from .normal_equations import CompressedScans, NormalEquations, Solution, WeighedScan
 from .parameters import LikelihoodParameters
 from .preconditioner import UNDETERMINED
-from .undetermined import undetermined
+from .undetermined import TINY, Patterns, undetermined
 
 MOST_ITERATIONS = 1000
 """Iterations of conjugate gradients at most."""
@@ -35,49 +39,188 @@ POOR = 1e-2
 
 
 @dataclass(frozen=True)
-class LikelihoodMaps(MapFromSums):
-    """Maps of the signals, from sums in pixels and compressed scans."""
+class LikelihoodSystem:
+    """Equations of the maps of all bands that share modes, and their solutions.
+
+    Attributes
+    ----------
+    parts
+        Of each band the grid, layout and sums of its map, whose pixels follow those of the band
+        before.
+    scans
+        With the detectors of all bands.
+    data
+        Those of the first band.
+    """
 
     parameters: LikelihoodParameters
+    parts: Sequence[tuple[Grid, Mapping[str, Any], MapSums]]
     scans: CompressedScans
+    data: Data
+    _solutions: dict[tuple[str, int | None], Solution] = field(default_factory=dict)
+
+    @cached_property
+    def pixels(self) -> list[slice]:
+        """Pixels of each band."""
+        ends = np.cumsum([0, *(grid.n_pixels for grid, _, _ in self.parts)]).tolist()
+        return [slice(*some) for some in pairwise(ends)]
+
+    @cached_property
+    def equations(self) -> NormalEquations:
+        """Normal equations of all scans, with the noise of data minus the map."""
+        found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
+        step, first = self.parameters, self.parts[0][2].first
+        for _ in range(step.refined):
+            solution = self._solve(found, first)
+            scans = []
+            for k, (one, (scan, noise)) in enumerate(
+                zip(self.scans.scans, found.scans, strict=True)
+            ):
+                y = one.data[first][0] - found.baselines(solution, k)
+                new = estimate(
+                    y,
+                    scan.counted,
+                    noise.white,
+                    scan.length,
+                    scan.rate,
+                    modes=step.modes,
+                    free=step.free,
+                    trend=step.trend,
+                    fixed=noise.modes[: noise.free],
+                    lacking=scan.lacking,
+                    groups=noise.groups,
+                    places=noise.places,
+                )
+                if step.noise != "estimated":
+                    new = replace(new, own=noise.own)  # that of a table
+                scans.append(WeighedScan(scan, new))
+            found = self._of(scans)
+        return found
+
+    @cached_property
+    def equations_of_halves(self) -> list[NormalEquations]:
+        """Normal equations of even and of odd scans, the same for all signals."""
+        return [self._of(self.equations.scans[half::2]) for half in range(2)]
+
+    def _of(self, scans: Sequence[WeighedScan]) -> NormalEquations:
+        n_stokes = 3 if self.parts[0][2].polarized else 1
+        return NormalEquations(
+            scans, n_stokes, self.pixels[-1].stop, self.data.threads, self._places
+        )
+
+    def _places(self, pixels: NDArray[np.intp]) -> Floats:
+        """(2, n) coordinates of pixels, rising; maps of several bands lie side by side."""
+        found, edge = list[Floats](), 0.0
+        for (grid, *_), own in zip(self.parts, self.pixels, strict=True):
+            some = pixels[(pixels >= own.start) & (pixels < own.stop)] - own.start
+            at = grid.places(some) if some.size else np.zeros((2, 0))
+            if len(self.parts) > 1 and some.size:
+                low, wide = at.min(axis=1, keepdims=True), max(float(np.ptp(at[0])), TINY)
+                at = (at - low) * [[1 / wide], [1.0]] + [[edge], [0.0]]
+                edge += 1.0
+            found.append(at)
+        return np.concatenate(found, axis=1)
+
+    def solved(self, stream: str, half: int | None = None) -> Solution:
+        """The solution for a signal, of all scans or of half of them; of several bands it is kept
+        for the others.
+        """
+        key = stream, half
+        if key in self._solutions:
+            return self._solutions[key]
+        equations = self.equations if half is None else self.equations_of_halves[half]
+        found = self._solve(equations, stream, half)
+        if len(self.parts) > 1:
+            self._solutions[key] = found
+        return found
+
+    def _solve(self, equations: NormalEquations, stream: str, half: int | None = None) -> Solution:
+        right = self.right_side(equations, stream, half)
+        step, told = self.parameters, [0]
+        what = product_name(stream, "map") if "equations" in vars(self) else "noise"
+        what += "" if half is None else f", half {half + 1}"
+
+        def tell(residual: float) -> None:
+            share = np.log(max(residual, step.tolerance)) / np.log(step.tolerance)
+            told[0] = max(told[0], int(100 * share))
+            self.data.progress(told[0], 100, f"{step.label}: iterations, {what}")
+
+        return equations.solve(right, step.tolerance, MOST_ITERATIONS, tell=tell)
+
+    def right_side(
+        self, equations: NormalEquations, stream: str, half: int | None = None
+    ) -> Floats:
+        """P^T Q d of a signal, of all scans or of half of them: of map and gaps."""
+        binned = [
+            sums.in_pixels(stream, slice(None), half).data.T / VALUE / layout["variance"]
+            for _, layout, sums in self.parts
+        ]
+        scans = self.scans.scans if half is None else self.scans.scans[half::2]
+        data = [one.data[stream] for one in scans]
+        return equations.right_side(np.concatenate(binned, axis=1), data)
+
+    @cached_property
+    def chi2(self) -> tuple[float, float]:
+        """chi^2 per degree of freedom, and its standard error: of the samples of all bands."""
+        data = [one.data[MAIN] for one in self.scans.scans]
+        right = self.right_side(self.equations, MAIN)
+        return self.equations.chi_square(self.solved(MAIN), right, data)
+
+    @cached_property
+    def patterns(self) -> Patterns:
+        """Patterns that the data hardly determine."""
+        return undetermined(self.equations, self.parameters.patterns)
+
+
+@dataclass(frozen=True)
+class LikelihoodMaps(MapFromSums):
+    """Maps of the signals in one band, from sums in pixels and the solutions of all bands."""
+
+    parameters: LikelihoodParameters
+    system: LikelihoodSystem
+    band: int
     data: Data
 
     def map_of(self, stream: str) -> MapProduct:
         """The map of a signal; its weights and its noise are those of white noise. Without filters
         it is the mean of the samples, of which the same is taken off.
         """
-        product, equations = super().map_of(stream), self.equations
-        if stream not in self.scans.scans[0].data:
+        product, system = super().map_of(stream), self.system
+        if stream not in system.scans.scans[0].data:
             rows = np.nan_to_num(product.planes["signal"].values)
             values = np.zeros((len(rows), self.grid.n_pixels))
             values[:, self._seen] = rows.reshape(len(rows), -1)
             return self._with_values(product, values, stream)
-        solution = self._solved(equations, stream)
+        solution, own = system.solved(stream), self._own
         if self.halves:
             (one, first), (two, second) = (self._half(stream, k, product) for k in range(2))
             with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.sqrt(equations.spread / (first.spread + second.spread))
-                values = np.where(
-                    (first.spread > 0) & (second.spread > 0), (one - two) * share, np.nan
-                )
+                share = np.sqrt(system.equations.spread[:, own] / (first + second))
+                values = np.where((first > 0) & (second > 0), (one - two) * share, np.nan)
             product = product.with_planes(half_difference=self._rows(product, values))
-        made = self._with_values(product, solution.values, stream)
+        made = self._with_values(product, solution.values[:, own], stream)
         if stream == MAIN:
-            made.chi2 = equations.chi_square(
-                solution,
-                self.right_side(equations, stream),
-                [one.data[stream] for one in self.scans.scans],
-            )
-            self._tell(solution, made.chi2)
-            self._publish(solution, made.chi2)
+            made.chi2 = system.chi2
+            self._tell(solution)
+            self._publish(solution)
             made = self._with_patterns(made)
         return made
 
-    def _publish(self, solution: Solution, chi2: tuple[float, float]) -> None:
+    @property
+    def _own(self) -> slice:
+        """The band's pixels among those of the equations."""
+        return self.system.pixels[self.band]
+
+    def _publish(self, solution: Solution) -> None:
         """Make the product `NoiseRecord`, and write its tables."""
+        chi2, scans = self.system.chi2, self.system.scans.scans
+        models = [noise for _, noise in self.system.equations.scans]
         record = NoiseRecord(
             list(self.sums.scans),
-            [noise for _, noise in self.equations.scans],
+            [
+                noise.of_some(slice(*one.ends[self.band :][:2]))
+                for noise, one in zip(models, scans, strict=True)
+            ],
             solution.history,
             solution.ritz,
             solution.before,
@@ -94,8 +237,9 @@ class LikelihoodMaps(MapFromSums):
         number, told = self.parameters.patterns, []
         if not number:
             return product
-        found, planes = undetermined(self.equations, number), dict(product.planes)
-        for k, (value, pattern) in enumerate(zip(*found, strict=True), 1):
+        found, planes = self.system.patterns, dict(product.planes)
+        for k, (value, whole) in enumerate(zip(*found, strict=True), 1):
+            pattern = whole[:, self._own]
             determined = value > UNDETERMINED
             told.append(f"{value:.1e}" if determined else f"< {UNDETERMINED:g}")
             title = f"Pattern {k}, Ritz value {told[-1]}"
@@ -125,7 +269,7 @@ class LikelihoodMaps(MapFromSums):
         """The product of a signal with these values, (n_stokes, n_pixels), and its weights as a
         template where it is without noise.
         """
-        rows = self._rows(product, self._determined(values, self.equations, product))
+        rows = self._rows(product, self._determined(values, self.system.equations, product))
         made = product.with_planes(signal=rows)
         made = replace(made, noise_from="streams", taken_off=self._taken)
         runs, signal = self.data.provenance.get("runs", {}), stream.partition("/")[2]
@@ -143,101 +287,39 @@ class LikelihoodMaps(MapFromSums):
 
         the weights of t beside unknown amplitudes of P. A' P = 0.
         """
-        equations = self.equations
-        weights, patterns = equations.apply(t), np.zeros((len(self._patterns), *t.shape))
+        weights, patterns = self._apply(t), np.zeros((len(self._patterns), *t.shape))
         patterns[:, 0, self._seen] = np.where(
             product.known.ravel(), self._patterns[:, self._seen], 0
         )
-        products = [equations.apply(one) for one in patterns]
+        white = self.system.equations.weights[0][self._own]
+        products = [self._apply(one) for one in patterns]
         for k, one in enumerate(patterns):
             for other, product_of in zip(patterns[:k], products[:k], strict=True):
                 share = float((one * product_of).sum())
                 one -= share * other
                 products[k] = products[k] - share * product_of
             size = float((one * products[k]).sum())
-            least = UNDETERMINED * float((equations.weights[0] * one[0] ** 2).sum())
+            least = UNDETERMINED * float((white * one[0] ** 2).sum())
             unit = 1 / np.sqrt(size) if size > least else 0.0
             one *= unit
             products[k] = products[k] * unit
             weights -= float((one * weights).sum()) * products[k]
         return weights
 
-    @cached_property
-    def equations(self) -> NormalEquations:
-        """Normal equations of all scans, with the noise of data minus the map."""
-        found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
-        step = self.parameters
-        for _ in range(step.refined):
-            solution = self._solved(found, self.sums.first)
-            scans = []
-            for k, (one, (scan, noise)) in enumerate(
-                zip(self.scans.scans, found.scans, strict=True)
-            ):
-                y = one.data[self.sums.first][0] - found.baselines(solution, k)
-                new = estimate(
-                    y,
-                    scan.counted,
-                    noise.white,
-                    scan.length,
-                    scan.rate,
-                    modes=step.modes,
-                    free=step.free,
-                    trend=step.trend,
-                    fixed=noise.modes[: noise.free],
-                    lacking=scan.lacking,
-                    groups=noise.groups,
-                    places=noise.places,
-                )
-                if step.noise != "estimated":
-                    new = replace(new, own=noise.own)  # that of a table
-                scans.append(WeighedScan(scan, new))
-            found = self._of(scans)
-        return found
+    def _apply(self, m: Floats) -> Floats:
+        """A m of a map (n_stokes, n_pixels), A the information of this band's map beside those of
+        other bands, which are unknown.
+        """
+        equations = self.system.equations
+        whole = np.zeros((len(m), equations.n_pixels))
+        whole[:, self._own] = m
+        return equations.apply(whole, self._own)[:, self._own]
 
-    @cached_property
-    def _equations_of_halves(self) -> list[NormalEquations]:
-        """Normal equations of even and of odd scans, the same for all signals."""
-        return [self._of(self.equations.scans[half::2]) for half in range(2)]
-
-    def _of(self, scans: Sequence[WeighedScan]) -> NormalEquations:
-        n_stokes = 3 if self.sums.polarized else 1
-        return NormalEquations(
-            scans, n_stokes, self.grid.n_pixels, self.data.threads, self.grid.places
-        )
-
-    def _solved(
-        self,
-        equations: NormalEquations,
-        stream: str,
-        half: int | None = None,
-    ) -> Solution:
-        """The solution for a signal, of all scans or of half of them."""
-        right = self.right_side(equations, stream, half)
-        step, told = self.parameters, [0]
-        what = product_name(stream, "map") if "equations" in vars(self) else "noise"
-        what += "" if half is None else f", half {half + 1}"
-
-        def tell(residual: float) -> None:
-            share = np.log(max(residual, step.tolerance)) / np.log(step.tolerance)
-            told[0] = max(told[0], int(100 * share))
-            self.data.progress(told[0], 100, f"{step.label}: iterations, {what}")
-
-        return equations.solve(right, step.tolerance, MOST_ITERATIONS, tell=tell)
-
-    def right_side(
-        self, equations: NormalEquations, stream: str, half: int | None = None
-    ) -> Floats:
-        """P^T Q d of a signal, of all scans or of half of them: of map and gaps."""
-        binned = self.sums.in_pixels(stream, slice(None), half).data.T / VALUE
-        scans = self.scans.scans if half is None else self.scans.scans[half::2]
-        data = [one.data[stream] for one in scans]
-        return equations.right_side(binned / self.layout["variance"], data)
-
-    def _half(self, stream: str, half: int, product: MapProduct) -> tuple[Floats, NormalEquations]:
-        """The map of the even or odd scans, and their equations."""
-        equations = self._equations_of_halves[half]
-        values = self._solved(equations, stream, half).values
-        return self._determined(values, equations, product), equations
+    def _half(self, stream: str, half: int, product: MapProduct) -> tuple[Floats, Floats]:
+        """The map of the even or odd scans, and its inverse weights (n_stokes, n_pixels)."""
+        equations = self.system.equations_of_halves[half]
+        values = self.system.solved(stream, half).values[:, self._own]
+        return self._determined(values, equations, product), equations.spread[:, self._own]
 
     @property
     def _seen(self) -> Any:
@@ -268,9 +350,8 @@ class LikelihoodMaps(MapFromSums):
     ) -> Floats:
         """A map without what the data hardly determine, as fitted to pixels with values."""
         values, weight = values.copy(), np.zeros(self.grid.n_pixels)
-        weight[self._seen] = np.where(
-            product.known, equations.weights[0][self._seen].reshape(product.hits.shape), 0.0
-        ).ravel()
+        white = equations.weights[0][self._own][self._seen].reshape(product.hits.shape)
+        weight[self._seen] = np.where(product.known, white, 0.0).ravel()
         patterns = self._patterns
         if not len(patterns):
             return values
@@ -285,9 +366,10 @@ class LikelihoodMaps(MapFromSums):
         shaped = values[:, self._seen].reshape(len(values), *product.hits.shape)
         return np.where(product.known, shaped, np.nan)
 
-    def _tell(self, solution: Solution, chi2: Sequence[float]) -> None:
+    def _tell(self, solution: Solution) -> None:
         """Log how the solution was found."""
         log, label, step = self.data.log, self.parameters.label, self.parameters
+        chi2 = self.system.chi2
         log.state(label, "iterations", str(len(solution.history)))
         if solution.history:
             least = min(solution.history)

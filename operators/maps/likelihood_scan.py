@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -37,41 +38,43 @@ LOCK = threading.Lock()
 
 
 @dataclass
-class LikelihoodScan:
-    """One observation: what `measure` finds, and the sums that `exec` adds to.
+class BandScan:
+    """A scan with the detectors of one band: what `prepare` knows, and where they stand in the
+    `LikelihoodScan` of all bands that share modes.
 
     Attributes
     ----------
     prepared
         Sums in pixels.
-    length
-        Samples of a baseline.
+    reference
+        Variance that weights are in units of, K^2.
+    spare
+        Arrays for sums of threads.
+    in_files
+        The compressed scan does not fit in memory.
     rows
         (n,) the good detectors.
-    baselines, common
-        By signal, fixed-point sums of baselines (n, n_base) and free modes (free, n_samp).
+    of_stream, of_scan
+        The band's detectors in the stream that is measured; the good ones in the scan.
+    first
+        Number of its first pixel in the scan.
     """
 
     prepared: Prepared
-    length: int
     observation: Observation
+    reference: float
+    spare: Any
+    in_files: bool = False
     rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
-    baselines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
-    common: dict[str, NDArray[np.int64]] = field(default_factory=dict)
-    found: Any = None
+    of_stream: slice = field(default_factory=lambda: slice(0))
+    of_scan: slice = field(default_factory=lambda: slice(0))
+    first: int = 0
     scan: Any = None
-    filler: Any = None
-    noise: Any = None
 
     @property
     def looking(self) -> Any:
         """Pointing of the detectors."""
         return self.prepared.halves[0][0].looking
-
-    @property
-    def nowhere(self) -> int:
-        """Number of the pixel of samples that do not count."""
-        return int(self.looking.grid.n_pixels)
 
     def pixels(
         self,
@@ -82,51 +85,147 @@ class LikelihoodScan:
     ) -> NDArray[np.int32]:
         """(n, stop - start) pixels of detectors, -1 of samples that do not count."""
         found: NDArray[np.int32] = self.looking.pixels(which, start, stop)
+        if self.first:
+            found[found >= 0] += self.first
         found[:, self.prepared.halves[0][0].samples[start:stop] == 0] = -1
         for signal in signals:
             found[~np.isfinite(signal)] = -1
         return found
 
+    def tiles(
+        self, detectors: slice, samples: slice, part: AnyFloats, mean: Any, nowhere: int
+    ) -> Iterator[tuple[NDArray[np.intp], Tile]]:
+        """Rows in the scan, and runs, of a block of the stream, tile after tile."""
+        begin = max(detectors.start, self.of_stream.start)
+        end = min(detectors.stop, self.of_stream.stop)
+        place = self.of_stream.start + self.rows
+        which = self.rows[(place >= begin) & (place < end)]
+        if not which.size:
+            return
+        angles, observation = self.prepared.halves[0][0].angles, self.observation
+        efficiency = observation.focalplane.polarization_efficiency[which, None]
+        rows = self.of_scan.start + np.searchsorted(self.rows, which)
+        for start in range(samples.start, samples.stop, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, samples.stop)
+            here = slice(start - samples.start, stop - samples.start)
+            at = which + self.of_stream.start
+            signal = np.asarray(part[at - detectors.start, here], np.float64)
+            if mean is not None:
+                signal += mean.evaluate(slice(begin, end), slice(start, stop))[at - begin]
+            cosine, sine = np.zeros((2, which.size, 0 if angles is None else stop - start))
+            if angles is not None:
+                angles.fill(which, start, cosine, sine)
+                cosine *= efficiency
+                sine *= efficiency
+            pixel, single = self.pixels(which, start, stop, signal), observation.hwp_angle
+            each = cosine, sine, single is not None
+            yield rows, Tile.of(signal, pixel, start, self.scan.length, nowhere, *each)
+
+    def weigh(self, white: Floats) -> Floats:
+        """Weigh detectors by the white level (n,) that was found: empty sums in pixels. Returns the
+        levels as fixed-point weights have them.
+        """
+        first, weight = self.prepared.halves[0][0], np.ones(self.observation.n_detectors)
+        weight[self.rows] = rounded = np.rint(self.reference / white * WEIGHT) / WEIGHT
+        made = binnings(
+            "scans",
+            self.looking,
+            Weights(weight, weight.copy(), np.zeros(0)),
+            first.samples.astype(bool),
+            self.spare,
+            signals=first.signals.stop - first.signals.start,
+            polarized=first.angles is not None,
+        )
+        self.prepared = replace(self.prepared, halves=made)
+        return np.asarray(self.reference / rounded)
+
+    def add(self, block: Block) -> None:
+        """Add a block to the sums of baselines and free modes."""
+        begin, end = np.searchsorted(self.rows, [block.detectors.start, block.detectors.stop])
+        which, scan = self.rows[begin:end], self.scan
+        at = slice(self.of_scan.start + begin, self.of_scan.start + end)
+        a = scan.scale * scan.noise.free_modes[:, at]
+        signals = self.prepared.signals(block)
+        rows = which - block.detectors.start
+        for start in range(block.samples.start, block.samples.stop, TILE_SAMPLES):
+            stop = min(start + TILE_SAMPLES, block.samples.stop)
+            here = slice(start - block.samples.start, stop - block.samples.start)
+            parts = [signal[rows, here] for signal in signals]
+            pixel = self.pixels(which, start, stop, *parts)
+            base = slice(start // scan.length, (stop - 1) // scan.length + 1)
+            for name, part in zip(block.signals, parts, strict=True):
+                if name not in scan.baselines:
+                    continue
+                y = np.zeros((which.size, base.stop - base.start), np.int64)
+                s = np.zeros((len(a), stop - start), np.int64)
+                add_baselines(part, pixel, start, scan.length, a, VALUE, y, s)
+                with LOCK:
+                    scan.baselines[name][at, base] += y
+                    scan.common[name][:, start:stop] += s
+
+
+@dataclass
+class LikelihoodScan:
+    """One observation: what `measure` finds, and the sums that `exec` adds to.
+
+    Attributes
+    ----------
+    bands
+        Those whose detectors share modes.
+    length
+        Samples of a baseline.
+    observation
+        With the detectors of all bands.
+    rows
+        (n,) the good detectors.
+    baselines, common
+        By signal, fixed-point sums of baselines (n, n_base) and free modes (free, n_samp).
+    """
+
+    bands: Sequence[BandScan]
+    length: int
+    observation: Observation
+    rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    baselines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    common: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    found: Any = None
+    scan: Any = None
+    filler: Any = None
+    noise: Any = None
+
     def compress(self, stream: Stream, place: str) -> None:
         """Find runs and baselines of the complete signal, in one reading."""
-        observation, mean = stream.observation, stream.means.get(MAIN)
-        self.rows = np.flatnonzero(observation.good_detectors)
-        if not self.rows.size:
-            raise PipelineError(
-                "no detector is good",
-                place=f"{place}, {observation.name}",
-                cure="leave this scan out, or look at the flags of its detectors",
-            )
-        self.found = RunsOfTiles(self.rows.size, observation.n_samples, self.length)
-        angles = self.prepared.halves[0][0].angles
-        single = observation.hwp_angle is not None
-        efficiency = observation.focalplane.polarization_efficiency
+        row, found, nowhere = 0, list[NDArray[np.intp]](), 0
+        for band in self.bands:
+            own = band.observation
+            band.rows, band.scan = np.flatnonzero(own.good_detectors), self
+            if not band.rows.size:
+                raise PipelineError(
+                    "no detector is good",
+                    place=f"{place}, {own.name}",
+                    cure="leave this scan out, or look at the flags of its detectors",
+                )
+            before = sum(rows.size for rows in found)
+            band.of_stream = slice(row, row + own.n_detectors)
+            band.of_scan, band.first = slice(before, before + band.rows.size), nowhere
+            found.append(row + band.rows)
+            row, nowhere = band.of_stream.stop, nowhere + int(band.looking.grid.n_pixels)
+        self.rows, mean = np.concatenate(found), stream.means.get(MAIN)
+        self.found = RunsOfTiles(self.rows.size, self.observation.n_samples, self.length)
 
         def tiles(detectors: slice, samples: slice, part: AnyFloats) -> list[Any]:
-            which = self.rows[(self.rows >= detectors.start) & (self.rows < detectors.stop)]
-            made: list[Any] = []
-            for start in range(samples.start, samples.stop, TILE_SAMPLES):
-                stop = min(start + TILE_SAMPLES, samples.stop)
-                here = slice(start - samples.start, stop - samples.start)
-                signal = np.asarray(part[which - detectors.start, here], np.float64)
-                if mean is not None:
-                    whole = mean.evaluate(detectors, slice(start, stop))
-                    signal += whole[which - detectors.start]
-                cosine, sine = np.zeros((2, which.size, 0 if angles is None else stop - start))
-                if angles is not None:
-                    angles.fill(which, start, cosine, sine)
-                    cosine *= efficiency[which, None]
-                    sine *= efficiency[which, None]
-                pixel = self.pixels(which, start, stop, signal)
-                made.append(
-                    Tile.of(signal, pixel, start, self.length, self.nowhere, cosine, sine, single)
-                )
-            return [np.searchsorted(self.rows, which), *made]
+            block = detectors, samples, part, mean, nowhere
+            return [tile for band in self.bands for tile in band.tiles(*block)]
 
-        for _, _, (rows, *made) in stream.sweep(tiles):
-            for tile in made:
+        for _, _, made in stream.sweep(tiles):
+            for rows, tile in made:
                 self.found.add(rows, tile)
-        self.scan = self.found.scan(observation.sample_rate, self.nowhere)
+        self.scan = self.found.scan(self.observation.sample_rate, nowhere)
+
+    def name(self, k: int) -> str:
+        """The name of a good detector."""
+        band = next(band for band in self.bands if k < band.of_scan.stop)
+        return str(band.observation.focalplane.names[band.rows[k - band.of_scan.start]])
 
     def white(self, place: str) -> Floats:
         """(n,) variance of white noise; the median of the others for detectors without samples.
@@ -142,9 +241,8 @@ class LikelihoodScan:
                 cure="leave this scan out, or look at the flags of its samples",
             )
         if (white <= 0).any():
-            name = observation.focalplane.names[self.rows[np.flatnonzero(white <= 0)[0]]]
             raise PipelineError(
-                f"detector {name} has no noise",
+                f"detector {self.name(int(np.nanargmin(white)))} has no noise",
                 place=place,
                 cure="add WhiteNoise, or flag this detector; or make the map with BinMap",
             )
@@ -189,7 +287,7 @@ class LikelihoodScan:
         if table is None:
             self.noise = of_scene(self.noise, observation, self.rows, place)
         else:
-            names = [observation.focalplane.names[row] for row in self.rows]
+            names = [self.name(k) for k in range(self.rows.size)]
             columns = table.of(names, place)
             white = columns.get("net", np.zeros(1)) ** 2 * observation.sample_rate
             if (white <= 0).any():
@@ -204,65 +302,30 @@ class LikelihoodScan:
         text = f"{ratio:.4g}"
         observation.log.state(step.label, "its white level over that of the streams, median", text)
 
-    def give_weights(self, reference: float, spare: Any, place: str) -> None:
-        """Weigh detectors by the white level that was found, in units of the inverse variance
-        ``reference``, K^2. Raises PipelineError for a level that is far from it.
+    def give_weights(self, place: str) -> None:
+        """Weigh detectors by the white level that was found, in units of the inverse variance of
+        their band, K^2. Raises PipelineError for a level that is far from it.
         """
-        observation, first = self.observation, self.prepared.halves[0][0]
-        weight = np.ones(observation.n_detectors)
-        apart = np.abs(np.log(self.noise.white / reference))
-        if apart.max() > np.log(MOST_APART):
-            k = int(apart.argmax())
-            raise PipelineError(
-                f"white noise of detector {observation.focalplane.names[self.rows[k]]} is"
-                f" {np.sqrt(self.noise.white[k]):.2g} K a sample, and"
-                f" {np.sqrt(reference):.2g} K by the NET of the first scan",
-                place=f"{place}, {observation.name}",
-                cure="add WhiteNoise, or make the map with BinMap; for recorded streams, state"
-                " their unit and NET",
-            )
-        rounded = np.rint(reference / self.noise.white * WEIGHT) / WEIGHT
-        weight[self.rows] = rounded
-        self.noise = replace(self.noise, white=reference / rounded)
-        made = binnings(
-            "scans",
-            self.looking,
-            Weights(weight, weight.copy(), np.zeros(0)),
-            first.samples.astype(bool),
-            spare,
-            signals=first.signals.stop - first.signals.start,
-            polarized=first.angles is not None,
-        )
-        self.prepared = replace(self.prepared, halves=made)
-        scan = self.scan
-        for name in sorted({*observation.signals} - observation.unfiltered):
-            self.baselines[name] = np.zeros(scan.shape, np.int64)
-            self.common[name] = np.zeros(
-                (len(self.noise.free_modes), observation.n_samples), np.int64
-            )
-
-    def add(self, block: Block) -> None:
-        """Add a block to the sums of baselines and free modes."""
-        begin, end = np.searchsorted(self.rows, [block.detectors.start, block.detectors.stop])
-        which = self.rows[begin:end]
-        a = self.scale * self.noise.free_modes[:, begin:end]
-        signals = self.prepared.signals(block)
-        rows = which - block.detectors.start
-        for start in range(block.samples.start, block.samples.stop, TILE_SAMPLES):
-            stop = min(start + TILE_SAMPLES, block.samples.stop)
-            here = slice(start - block.samples.start, stop - block.samples.start)
-            parts = [signal[rows, here] for signal in signals]
-            pixel = self.pixels(which, start, stop, *parts)
-            base = slice(start // self.length, (stop - 1) // self.length + 1)
-            for name, part in zip(block.signals, parts, strict=True):
-                if name not in self.baselines:
-                    continue
-                y = np.zeros((which.size, base.stop - base.start), np.int64)
-                s = np.zeros((len(a), stop - start), np.int64)
-                add_baselines(part, pixel, start, self.length, a, VALUE, y, s)
-                with LOCK:
-                    self.baselines[name][begin:end, base] += y
-                    self.common[name][:, start:stop] += s
+        white = np.empty(self.rows.size)
+        for band in self.bands:
+            found = self.noise.white[band.of_scan]
+            apart = np.abs(np.log(found / band.reference))
+            if apart.max() > np.log(MOST_APART):
+                k = int(apart.argmax())
+                raise PipelineError(
+                    f"white noise of detector {self.name(band.of_scan.start + k)} is"
+                    f" {np.sqrt(found[k]):.2g} K a sample, and"
+                    f" {np.sqrt(band.reference):.2g} K by the NET of the first scan",
+                    place=f"{place}, {band.observation.name}",
+                    cure="add WhiteNoise, or make the map with BinMap; for recorded streams, state"
+                    " their unit and NET",
+                )
+            white[band.of_scan] = band.weigh(found)
+        self.noise = replace(self.noise, white=white)
+        first = self.bands[0].observation
+        for name in sorted({*first.signals} - first.unfiltered):
+            self.baselines[name] = np.zeros(self.scan.shape, np.int64)
+            self.common[name] = np.zeros((len(self.noise.free_modes), first.n_samples), np.int64)
 
     @property
     def scale(self) -> float:
@@ -280,4 +343,5 @@ class LikelihoodScan:
             )
             s = self.common[name] / (VALUE * self.scale)
             data[name] = (y, scan.about_means(s, y, a))
-        return Compressed(scan, self.noise, data)
+        ends = [0, *(band.of_scan.stop for band in self.bands)]
+        return Compressed(scan, self.noise, data, ends)

@@ -12,6 +12,7 @@ After the first solution the noise is estimated anew from baselines minus those 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -26,9 +27,9 @@ from zonda.core.plan.planning import planning_of
 
 from .bin_map import BinMap
 from .binning import Weights
-from .likelihood_maps import LikelihoodMaps
-from .likelihood_scan import LikelihoodScan
-from .map_sums import MapSums
+from .likelihood_maps import LikelihoodMaps, LikelihoodSystem
+from .likelihood_scan import BandScan, LikelihoodScan
+from .map_layout import MapLayout
 from .normal_equations import CompressedScans
 from .parameters import LikelihoodParameters
 
@@ -53,7 +54,6 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
 
     provides: ClassVar[frozenset[str]] = frozenset({"map", "noise_model"})
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
-    all_bands: ClassVar[bool] = False
     linear: ClassVar[bool] = False
     averages: ClassVar[bool] = False
     unfiltered: ClassVar[bool] = True
@@ -61,6 +61,12 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
     _samples: tuple[int, int] = PrivateAttr((0, 0))
     _at_once: int = PrivateAttr(1)
     _in_files: bool = PrivateAttr(False)
+    _bands: int = PrivateAttr(1)
+
+    @property
+    def all_bands(self) -> bool:  # type: ignore[override]
+        """True where the modes are those of all bands' detectors."""
+        return self.group == "all"
 
     def observe(self, data: Data) -> None:
         """Lay out one grid for all observations, and count their samples and threads."""
@@ -68,6 +74,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         every = [(o.n_detectors * o.n_samples, o.n_samples) for o in data.observations]
         self._samples = sum(n for n, _ in every), sum(n for _, n in every)
         self._at_once = min(data.threads, len(every))
+        self._bands = data.n_bands if self.all_bands else 1
         if data.files is not None and every:
             planning: Any = planning_of(self)
             longest = max(data.observations, key=lambda o: o.n_detectors * o.n_samples)
@@ -116,31 +123,38 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
                 " or make the map with BinMap",
             )
 
-    def prepare(self, observation: Observation) -> LikelihoodScan:  # type: ignore[override]
+    def prepare(self, observation: Observation) -> BandScan:  # type: ignore[override]
         """Pixels and baselines of one observation, before its samples are read.
 
         Raises PipelineError where a window has changed the samples, and for too few or too short
         baselines.
         """
-        place = f"{self.label}, {observation.name}"
-        length = self._length(observation)
+        self._length(observation)
         if observation.window is not None:
             raise PipelineError(
                 f"{' and '.join(observation.windows)} changed the weight of samples",
-                place=place,
+                place=f"{self.label}, {observation.name}",
                 cure="leave the window out: slow noise needs none here",
             )
         prepared = super().prepare(observation)
-        return LikelihoodScan(prepared, length, observation)
+        more = self._layout["variance"], self._spare, self._in_files
+        return BandScan(prepared, observation, *more)
 
-    def measure(self, stream: Stream, model: Any = None) -> LikelihoodScan:
-        """Compress a scan and estimate its noise, in one reading."""
-        scan: LikelihoodScan = stream.state
+    def measure(self, stream: Stream, model: Any = None) -> BandScan | LikelihoodScan:
+        """Compress a scan and estimate its noise, in one reading; with `group: all` that of all
+        bands. A sample that one band flags is a gap of this band.
+        """
+        bands: Sequence[BandScan] = stream.states or [stream.state]
+        observation = stream.observation
+        if len(bands) > 1:
+            flags = [band.observation.flags for band in bands]
+            observation.flags = np.bitwise_and.reduce(flags)
+        scan = LikelihoodScan(bands, self._length(observation), observation)
         scan.compress(stream, self.label)
-        observation, white = stream.observation, scan.white(self.label)
+        white = scan.white(self.label)
         place = f"{self.label}, {observation.name}"
         number = int(np.count_nonzero(scan.found.counted.any(axis=0)))
-        self._need_baselines(number, self.baseline_of(stream.observation), place)
+        self._need_baselines(number, self.baseline_of(observation), place)
         for _ in range(WHITE_LEVELS):
             scan.noise = scan.estimate(white, self)
             white = np.where(scan.noise.fast < STEADY, white * scan.noise.fast, white)
@@ -158,32 +172,39 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
             )
         if self.noise != "estimated":
             scan.state_noise(self, self._table)
-        scan.give_weights(self._layout["variance"], self._spare, self.label)
-        return scan
+        scan.give_weights(self.label)
+        return scan if len(bands) > 1 else bands[0]
 
-    def exec(self, block: Block, state: LikelihoodScan) -> None:  # type: ignore[override]
-        """Add one block to the sums in pixels, baselines and free modes."""
-        super().exec(block, state.prepared)
-        state.add(block)
+    def of_rows(self, measured: LikelihoodScan, rows: slice) -> BandScan:
+        """The part of one band, whose detectors these are."""
+        return next(band for band in measured.bands if band.of_stream == rows)
+
+    def exec_bands(self, blocks: Sequence[Block], states: Sequence[Any]) -> None:
+        """Add blocks to the sums in pixels, baselines and free modes."""
+        super().exec_bands(blocks, [state.prepared for state in states])
+        for block, state in zip(blocks, states, strict=True):
+            state.add(block)
 
     def collect(  # type: ignore[override]
         self,
         data: Data,
         observation: Observation,
-        state: LikelihoodScan,
+        state: BandScan,
     ) -> None:
-        """Hand over sums in pixels, and the compressed scan."""
+        """Hand over sums in pixels, and the compressed scan, that of all bands with the first."""
         super().collect(data, observation, state.prepared)
         data.partial[self.label].unknown_variance = False  # type: ignore[attr-defined]
-        scans = CompressedScans([state.compressed()])
-        if self._in_files:
-            scans = CompressedScans.of(data.files.put(scans.arrays()))
-            observation.log.state(self.label, "compressed scans", "in temporary files")
-        data.add(f"{self.label} scans", scans)
-        log, noise = observation.log, state.noise
-        seconds = state.length / observation.sample_rate
-        log.state(self.label, "length of a baseline", f"{seconds:.3g} s, {state.length} samples")
-        lost = observation.n_samples % state.length
+        scan: LikelihoodScan = state.scan
+        if state is scan.bands[0]:
+            scans = CompressedScans([scan.compressed()])
+            if any(band.in_files for band in scan.bands):
+                scans = CompressedScans.of(data.files.put(scans.arrays()))
+                observation.log.state(self.label, "compressed scans", "in temporary files")
+            data.add(f"{self.label} scans", scans)
+        log, noise = observation.log, scan.noise
+        seconds = scan.length / observation.sample_rate
+        log.state(self.label, "length of a baseline", f"{seconds:.3g} s, {scan.length} samples")
+        lost = observation.n_samples % scan.length
         if lost:
             log.state(self.label, "samples of the last baseline, which is shorter", str(lost))
         powers = ", ".join(f"{value:.3g}" for value in noise.values)
@@ -191,17 +212,28 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
 
     def finalize(self, data: Data) -> None:
         """Solve for the map of each signal."""
-        if made := self.maps(data):
+        self.finalize_bands([data])
+
+    def finalize_bands(self, every: Sequence[Data]) -> None:
+        """Solve for the maps of all bands that share modes."""
+        for made, data in zip(self.maps(every), every, strict=False):
             made.finish(data)
 
-    def maps(self, data: Data) -> LikelihoodMaps | None:
-        """Equations and sums for the maps of all signals; None where there is no scan."""
+    def maps(self, every: Sequence[Data]) -> list[LikelihoodMaps]:
+        """Equations and sums for the maps of all signals, of each band; none without a scan."""
         self._spare.clear()
-        sums: MapSums | None = data.take(self.label)
-        scans: CompressedScans | None = data.take(f"{self.label} scans")
-        if sums is None or scans is None:
-            return None
-        return LikelihoodMaps(self, self.grid, self._layout, sums, scans, data)
+        sums = [data.take(self.label) for data in every]
+        scans: CompressedScans | None = every[0].take(f"{self.label} scans")
+        if scans is None:
+            return []
+        layouts = [data.layouts[self.label] for data in every] if len(every) > 1 else [self._layout]
+        grids = [MapLayout(self).grid(layout) for layout in layouts[1:]]
+        parts = list(zip([self.grid, *grids], layouts, sums, strict=True))
+        system = LikelihoodSystem(self, parts, scans, every[0])
+        return [
+            LikelihoodMaps(self, *part, system, band, data)
+            for band, (part, data) in enumerate(zip(parts, every, strict=True))
+        ]
 
     def _weights(self, observation: Observation) -> tuple[Weights, NDArray[np.bool_]]:
         """Equal weights, until `measure` knows those of the detectors."""

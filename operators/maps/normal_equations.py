@@ -51,11 +51,14 @@ EXACT, MOST = 1e-10, 1000
 
 @dataclass
 class Compressed:
-    """A compressed scan, its noise, and y and s of its signals."""
+    """A compressed scan, its noise, y and s of its signals, and the first detector of each band and
+    their number.
+    """
 
     scan: CompressedScan
     noise: BaselineNoise
     data: dict[str, tuple[Floats, Floats]]
+    ends: list[int]
 
 
 class CompressedScans(Product):
@@ -78,6 +81,7 @@ class CompressedScans(Product):
                     "scan": vars(c.scan),
                     "noise": vars(c.noise),
                     "data": {n: list(d) for n, d in c.data.items()},
+                    "ends": c.ends,
                 }
                 for c in self.scans
             ]
@@ -92,6 +96,7 @@ class CompressedScans(Product):
                     CompressedScan(**one["scan"]),
                     BaselineNoise(**one["noise"]),
                     {name: tuple(pair) for name, pair in one["data"].items()},
+                    one["ends"],
                 )
                 for one in arrays["scans"]
             ]
@@ -235,20 +240,21 @@ class NormalEquations:
             out[0, gaps] = scan.in_gaps(y / noise.white[:, None])
         return out + self._added(data.__getitem__)
 
-    def apply(self, m: Floats) -> Floats:
-        """P^T Q P m, Q of the samples that count."""
-        return self.eliminated(self._product(self._widened(m)))
+    def apply(self, m: Floats, own: slice = slice(None)) -> Floats:
+        """P^T Q P m, Q of the samples that count; ``own``: as of `eliminated`."""
+        return self.eliminated(self._product(self._widened(m)), own)
 
-    def eliminated(self, right: Floats) -> Floats:
-        """A right side, or a product, of the map alone (n_stokes, n_pixels): gaps are solved for by
-        conjugate gradients, and what they make of the map is taken off.
+    def eliminated(self, right: Floats, own: slice = slice(None)) -> Floats:
+        """A right side, or a product, of the pixels ``own`` of the map alone (n_stokes, n_pixels):
+        gaps, and other pixels, are solved for by conjugate gradients, and what they make of the map
+        is taken off.
         """
-        if right.shape[1] > self.n_pixels:
-            inverse = self._inverse.copy()
-            inverse[:, : self.n_pixels] = 0.0
-            gaps = self.solve(right, EXACT, MOST, inverse).gaps
-            zero = np.zeros((self.n_stokes, self.n_pixels))
-            right = right - self._product(np.concatenate([zero, gaps], axis=1))
+        inverse = self._inverse.copy()
+        inverse[:, : self.n_pixels][:, own] = 0.0
+        if inverse.any():
+            others = self.solve(right, EXACT, MOST, inverse)
+            values = np.concatenate([others.values, others.gaps], axis=1)
+            right = right - self._product(values)
         return right[:, : self.n_pixels]
 
     def _product(self, m: Floats) -> Floats:

@@ -230,9 +230,9 @@ class LikelihoodParameters(MapParameters):
     detectors (destriping with a noise prior)."""
     free: int = Field(1, ge=0, le=20)
     """Number of modes without weight at any frequency, within baselines too."""
-    group: Literal["band", "wafer"] = "band"
-    """The detectors that share modes: those of a band, or of each wafer, which then has `modes` and
-    `free` of its own."""
+    group: Literal["band", "wafer", "all"] = "band"
+    """The detectors that share modes: those of a band, of each wafer, which then has `modes` and
+    `free` of its own, or of all bands of the camera, whose maps are then found together."""
     trend: int = Field(1, ge=0, le=10)
     """Degree of the polynomial of each detector's scan that is taken off."""
     noise: Literal["estimated", "simulated"] | InputPath = "estimated"  # type: ignore[assignment]
@@ -246,13 +246,6 @@ class LikelihoodParameters(MapParameters):
     undetermined: Literal["none", "mean", "plane"] | None = None
     """What is taken off the map of I, weighted by its hits, since the data hardly determine it;
     where absent, a plane of a TAN image, the mean of other maps."""
-
-    @field_validator("group", mode="before")
-    @classmethod
-    def _bands_are_apart(cls, value: Any) -> Any:
-        if value == "all":
-            raise ValueError("each band has a map and modes of its own; write band or wafer")
-        return value
 
     @field_validator("noise", mode="before")
     @classmethod
@@ -276,6 +269,10 @@ class LikelihoodParameters(MapParameters):
             )
         if self.noise == "simulated" and "refine" in self.model_fields_set:
             raise ValueError("refine belongs to noise: estimated; simulated noise stays as it is")
+        if self.noise == "simulated" and self.group == "all":
+            raise ValueError(
+                "noise: simulated is that of one band; with group: all it is estimated, or a table"
+            )
         if self.split != "scans":
             raise ValueError("half_difference is that of even and odd scans; write true or scans")
         if self.undetermined == "plane" and self.kind != "TAN":

@@ -154,7 +154,11 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         scan = int(50 * self.baselines(observation)) + 32 * free * observation.n_samples
         if self.operator._in_files:
             scan += PART + 80 * int(self.baselines(observation))
-        return most + 8 * maps * self.pixels + at_once * scan, product + COMPILED
+        bands = self.operator._bands
+        if bands > 1:  # solutions are kept for other bands
+            maps += stokes * self._solutions(observation)
+        work = 8 * maps * self.pixels + at_once * scan
+        return most + bands * work, product + COMPILED
 
     def baselines(self, observation: Observation) -> float:
         """Baselines of all detectors in a scan."""
