@@ -159,12 +159,12 @@ class LikelihoodSystem:
         data = [one.data[stream] for one in scans]
         return equations.right_side(np.concatenate(binned, axis=1), data)
 
-    @cached_property
-    def chi2(self) -> tuple[float, float]:
-        """chi^2 per degree of freedom, and its standard error: of the samples of all bands."""
+    def chi_square(self, found: Solution) -> tuple[float, float]:
+        """chi^2 of the complete signal, of all bands, per degree of freedom; and its standard
+        error.
+        """
         data = [one.data[MAIN] for one in self.scans.scans]
-        right = self.right_side(self.equations, MAIN)
-        return self.equations.chi_square(self.solved(MAIN), right, data)
+        return self.equations.chi_square(found, self.right_side(self.equations, MAIN), data)
 
     @cached_property
     def patterns(self) -> Patterns:
@@ -200,9 +200,9 @@ class LikelihoodMaps(MapFromSums):
             product = product.with_planes(half_difference=self._rows(product, values))
         made = self._with_values(product, solution.values[:, own], stream)
         if stream == MAIN:
-            made.chi2 = system.chi2
-            self._tell(solution)
-            self._publish(solution)
+            made.chi2 = system.chi_square(solution)
+            self._tell(solution, made.chi2)
+            self._publish(solution, made.chi2)
             made = self._with_patterns(made)
         return made
 
@@ -211,15 +211,14 @@ class LikelihoodMaps(MapFromSums):
         """The band's pixels among those of the equations."""
         return self.system.pixels[self.band]
 
-    def _publish(self, solution: Solution) -> None:
+    def _publish(self, solution: Solution, chi2: tuple[float, float]) -> None:
         """Make the product `NoiseRecord`, and write its tables."""
-        chi2, scans = self.system.chi2, self.system.scans.scans
         models = [noise for _, noise in self.system.equations.scans]
         record = NoiseRecord(
             list(self.sums.scans),
             [
                 noise.of_some(slice(*one.ends[self.band :][:2]))
-                for noise, one in zip(models, scans, strict=True)
+                for noise, one in zip(models, self.system.scans.scans, strict=True)
             ],
             solution.history,
             solution.ritz,
@@ -366,10 +365,9 @@ class LikelihoodMaps(MapFromSums):
         shaped = values[:, self._seen].reshape(len(values), *product.hits.shape)
         return np.where(product.known, shaped, np.nan)
 
-    def _tell(self, solution: Solution) -> None:
+    def _tell(self, solution: Solution, chi2: Sequence[float]) -> None:
         """Log how the solution was found."""
         log, label, step = self.data.log, self.parameters.label, self.parameters
-        chi2 = self.system.chi2
         log.state(label, "iterations", str(len(solution.history)))
         if solution.history:
             least = min(solution.history)
