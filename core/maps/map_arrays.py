@@ -89,6 +89,10 @@ def _plane(product: MapArrays, size: int) -> tuple[Any, tuple[int, int]]:
     return wcs, (int(numbers[0]), int(numbers[1]))
 
 
+NOISE_MODELS = {"net": "simulated", "streams": "estimated", "table": "table"}
+"""NOISEMOD of headers: of a maximum-likelihood map, by what its white noise comes from."""
+
+
 @dataclass(init=False)
 class MapArrays:
     """A map in the TAN or CAR projection, arrays (ny, nx), or in HEALPix, arrays (n_pixel,) for the
@@ -137,6 +141,9 @@ class MapArrays:
         Names of the observations in it.
     sample_rate
         Of all scans [Hz]; 0 where it is unknown or they differ.
+    noise_from
+        Origin of the white noise: NETs, the scatter of samples, or of a maximum-likelihood map the
+        streams or a table.
     contents
         ``hits``: nothing else was made, ``signal`` and ``noise`` are NaN.
     scan_hits
@@ -166,7 +173,7 @@ class MapArrays:
     frame: str = "icrs"
     unit: str = "K_RJ"
     weighting: Literal["uniform", "inverse_variance"] = "uniform"
-    noise_from: Literal["net", "scatter", "streams"] = "net"
+    noise_from: Literal["net", "scatter", "streams", "table"] = "net"
     nside: int = 0
     nest: bool = False
     pixels: NDArray[np.int64] | None = None

@@ -21,7 +21,7 @@ from ..storage.files import atomic_path
 from ..storage.fits_files import header_of, joined, table_bytes, write_image
 from ..versions import versions
 from .header import exact_header
-from .map_arrays import MapArrays
+from .map_arrays import NOISE_MODELS, MapArrays
 from .planes import ELSEWHERE, Plane, stated
 from .units import scale_of
 
@@ -234,6 +234,8 @@ class MapFile:
         if any(chi2 := self.product.chi2):
             cards.append(("CHI2", chi2[0], "of samples minus map, per degree of freedom"))
             cards.append(("CHI2ERR", chi2[1], "standard error, if noise is as modelled"))
+            model = NOISE_MODELS[self.product.noise_from]
+            cards.append(("NOISEMOD", model, "where the noise model comes from"))
         if (index := self.product.spectral_index) is not None:
             cards.append(("SPECINDX", index, "of the flux density, for the unit: at RESTFRQ"))
         return header_of(cards, about.history)

@@ -17,6 +17,7 @@ from ..numerics.sphere import angles
 from ..storage.fits_files import check_size, opened
 from .grid import HealpixPixels, wcs_grid
 from .header import FileHeader, exact_header
+from .map_arrays import NOISE_MODELS
 from .map_file import Provenance
 from .map_product import MapProduct
 from .map_reading import HealpixTable, celestial, chosen, is_healpix, q_and_u
@@ -188,6 +189,7 @@ class _Reader(FileHeader):
         major, minor = (self.number(key) or 0.0 for key in ("BMAJ", "BMIN"))
         low, high = (math.radians(self.number(k) or major) for k in ("BEAMLOW", "BEAMHIGH"))
         known = self._band(band)
+        noise = self.text("NOISEMOD")
         kept = [key for key in ABOUT if known is None or key not in ("RESTFRQ", "BAND")]
         made = MapProduct(
             planes=planes,
@@ -199,6 +201,7 @@ class _Reader(FileHeader):
             spectral_index=self.number("SPECINDX"),
             taken_off=self.text("TAKENOFF"),
             chi2=(self.number("CHI2") or 0.0, self.number("CHI2ERR") or 0.0),
+            noise_from=next((k for k, v in NOISE_MODELS.items() if v == noise), "net"),
             contents=contents,
             **self.where,
         )

@@ -172,7 +172,7 @@ def draw_map_spectra(found: MapSpectra, file: str, where: str) -> list[Sketch]:
     what = "Power spectral densities of the maps in rings of angular scale under a cosine window"
     caption = f"{what} over the well covered field."
     if found.spectra.white:
-        caption += " Dashed: the level of white noise by NET and samples."
+        caption += " Dashed: the level of the white noise that the maps state."
     if found.fwhm:
         caption += f" Dotted: the beam, {angle_text(found.fwhm)} FWHM."
     return [Sketch(file, "Radial power spectra of maps", caption, ax)]

@@ -226,10 +226,11 @@ class LikelihoodMaps(MapFromSums):
             chi2,
             self.parameters.tolerance,
             self.parameters.label,
+            self.parameters.model,
         )
         product = self.parameters.product
         key = "noise_model" if product == "map" else f"noise_model_{product}"
-        publish(self.data, key, record, record.tables(), CHI2=chi2[0])
+        publish(self.data, key, record, record.tables(), CHI2=chi2[0], NOISE=record.noise)
 
     def _with_patterns(self, product: MapProduct) -> MapProduct:
         """The product with planes of the patterns that the data hardly determine, if asked for."""
@@ -270,7 +271,7 @@ class LikelihoodMaps(MapFromSums):
         """
         rows = self._rows(product, self._determined(values, self.system.equations, product))
         made = product.with_planes(signal=rows)
-        made = replace(made, noise_from="streams", taken_off=self._taken)
+        made = replace(made, noise_from=self.parameters.noise_from, taken_off=self._taken)
         runs, signal = self.data.provenance.get("runs", {}), stream.partition("/")[2]
         if signal not in runs or not Signal(**runs[signal]).is_source:
             return made

@@ -298,7 +298,6 @@ class LikelihoodScan:
                 )
             self.noise = of_table(self.estimate(white, step), columns)
         ratio = np.median(np.sqrt(self.noise.white / found))
-        observation.log.state(step.label, "noise model", str(step.noise))
         text = f"{ratio:.4g}"
         observation.log.state(step.label, "its white level over that of the streams, median", text)
 

@@ -203,6 +203,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
             data.add(f"{self.label} scans", scans)
         log, noise = observation.log, scan.noise
         seconds = scan.length / observation.sample_rate
+        log.state(self.label, "noise model", self.model)
         log.state(self.label, "length of a baseline", f"{seconds:.3g} s, {scan.length} samples")
         lost = observation.n_samples % scan.length
         if lost:

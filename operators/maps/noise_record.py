@@ -39,6 +39,8 @@ class NoiseRecord:
         Per degree of freedom of the samples, and its standard error.
     tolerance, label
         Residual that was wanted; the step.
+    noise
+        Where the models come from, in words.
     """
 
     scans: list[str]
@@ -49,6 +51,7 @@ class NoiseRecord:
     chi2: tuple[float, float]
     tolerance: float
     label: str
+    noise: str
 
     def tables(self) -> dict[str, list[Column]]:
         """Spectra and power of the modes of each scan, residuals and Ritz values."""
@@ -116,9 +119,10 @@ class NoiseRecord:
         finish(right, "mode", f"{up}, below 1 Hz", "Power of modes")
         value, error = self.chi2
         caption = (
-            "Spectra of the noise model, in units of white noise (dashed): of each detector, and of"
-            " modes that detectors share, beside it; free modes have no weight in the map. A line"
-            f" for each of {len(self.models)} scans. Right: mean power of the modes below 1 Hz."
+            f"Spectra of the noise model ({self.noise}), in units of white noise (dashed): of each"
+            " detector, and of modes that detectors share, beside it; free modes have no weight in"
+            f" the map. A line for each of {len(self.models)} scans. Right: mean power of the modes"
+            " below 1 Hz."
             f" χ² per sample is {value:.4g} ± {error:.1g}."
         )
         return Sketch(name, "Noise model", caption, left)
@@ -149,5 +153,6 @@ class NoiseRecord:
             for scan, model in zip(self.scans, self.models, strict=True)
         ]
         value, error = self.chi2
+        rows.append(("noise model", self.noise))
         rows.append(("chi^2 per sample", f"{value:.5g} +- {error:.1g}"))
         return html_table("Power of modes over white noise", rows)

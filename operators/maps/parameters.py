@@ -5,6 +5,7 @@ noise (a jackknife).
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -297,6 +298,20 @@ class LikelihoodParameters(MapParameters):
         """(n_det,) number of the group of each detector."""
         plane = observation.focalplane
         return np.asarray(plane.wafer if self.group == "wafer" else 0 * plane.wafer, np.intp)
+
+    @property
+    def model(self) -> str:
+        """Origin of the noise model, in words."""
+        if isinstance(self.noise, Path):
+            return f"white levels and spectra of {self.noise.name}, modes from the streams"
+        return "closed forms of the scene" if self.noise == "simulated" else "from the streams"
+
+    @property
+    def noise_from(self) -> Literal["net", "streams", "table"]:
+        """Origin of the white level, as of `MapArrays`."""
+        if isinstance(self.noise, Path):
+            return "table"
+        return "net" if self.noise == "simulated" else "streams"
 
     @property
     def refined(self) -> int:

@@ -232,7 +232,13 @@ def test_simulated_noise_is_that_of_the_scene():
     one, two = data["map"], other["map"]
     ok = one.hits > 0.3 * np.percentile(one.hits, 98)
     assert one.signal[ok].std() == pytest.approx(two.signal[ok].std(), rel=0.1)
-    assert ("Keeps", "noise model", "simulated") in data.observations[0].log.figures()
+    for made, text, source in (
+        (data, "closed forms of the scene", "net"),
+        (other, "from the streams", "streams"),
+    ):
+        assert ("Keeps", "noise model", text) in made.observations[0].log.figures()
+        assert made["noise_model"].noise == text
+        assert made["map"].noise_from == source
 
 
 def test_noise_of_a_table(tmp_path):
@@ -249,6 +255,9 @@ def test_noise_of_a_table(tmp_path):
     f = noise.frequency[5]
     assert noise.own[5] == pytest.approx(1 + np.mean((knee / f) ** 1.5), rel=1e-6)
     assert np.nanmedian(data["map"].noise) > 0
+    data["map"].write(tmp_path / "map.fits")
+    assert data["map"].noise_from == zonda.read_map(tmp_path / "map.fits").noise_from == "table"
+    assert "white levels and spectra of t.ecsv" in data["noise_model"].noise
     table.write_text("\n".join([HEAD, *rows[1:]]) + "\n")
     with pytest.raises(zonda.ZondaError, match="not in") as caught:
         of_detectors(table)
