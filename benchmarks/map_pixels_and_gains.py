@@ -3,6 +3,7 @@
 
     python benchmarks/map_pixels_and_gains.py m2         # MUSTANG-2, a daisy of 8.6 min
     python benchmarks/map_pixels_and_gains.py survey     # constant-elevation scans, I
+    python benchmarks/map_pixels_and_gains.py gains      # the same, gains wrong by 0 to 5 %
     python benchmarks/map_pixels_and_gains.py bilinear   # samples see one pixel, or four; 60 s
 
 The sky is mapped without noise, with filters and noise models of the complete signal. Its transfer
@@ -31,6 +32,7 @@ PIXELS = {"beam / 4.5": 1 / 4.5, "beam / 2": 1 / 2, "beam / 1.5": 1 / 1.5}
 SCALES = {"m2": [720, 320, 150, 70, 30], "survey": [18000, 7200, 2880, 1150, 460]}
 FULL = {"sky": {"only": ["sky"], "modes": "full"}}
 GAINS = {"right": "0 %", "5 % wrong": "5 %"}
+SERIES = {"right": "0 %"} | {f"{k} % wrong": f"{k} %" for k in (1, 2, 5)}
 
 
 def scene_of(kind: str, seed: int, folder: str) -> tuple[zonda.Scene, list[Any], list[Any]]:
@@ -69,19 +71,19 @@ def kept(scene: zonda.Scene, steps: Sequence[Any], gain: str) -> Any:
     return pipeline.run(scene, threads=1, keep=["signal", "signal/sky"])
 
 
-def study(kind: str, seed: int) -> None:
+def study(kind: str, seed: int, pixels: dict[str, float], gains: dict[str, str]) -> None:
     """Transfer and errors by pixel, gains and map maker."""
     with TemporaryDirectory() as folder:
         scene, steps, filters = scene_of(kind, seed, folder)
-        runs = {name: kept(scene, steps, gain) for name, gain in GAINS.items()}
+        runs = {name: kept(scene, steps, gain) for name, gain in gains.items()}
         beam = runs["right"].observations[0].instrument.beam_fwhm
         baseline = {"baseline": "0.1 s"} if kind == "survey" else {}
-        for pixel, share in PIXELS.items():
+        for pixel, share in pixels.items():
             how = {"pixel": f"{share * beam} rad", "half_difference": False}
             truth = zonda.map(runs["right"], [zonda.BinMap(**how)], threads=1)["sky/map"]
             rings = map_makers.Rings(truth, SCALES[kind])
             true, use = rings.flat(truth.signal), rings.w > 0.5
-            if share == 1 / 4.5:
+            if pixel == next(iter(pixels)):
                 scales = " ".join(f"{s:6.0f}" for s in rings.scale)
                 print(f"{'pixel, gains, map maker':44s} scale {scales} arcsec  error %")
             for gain, data in runs.items():
@@ -90,10 +92,8 @@ def study(kind: str, seed: int) -> None:
                     "mean of samples": [zonda.BinMap(**how)],
                     "filter and bin": [*filters, zonda.BinMap(**how)],
                     "maximum likelihood": [zonda.MaximumLikelihoodMap(**likely)],
+                    "modes: 0": [zonda.MaximumLikelihoodMap(**likely, modes=0, free=0)],
                 }
-                if gain == "right":
-                    destriper = zonda.MaximumLikelihoodMap(**likely, modes=0, free=0)
-                    endings["modes: 0"] = [destriper]
                 for name, ending in endings.items():
                     m = zonda.map(data, ending, threads=1)["sky/map"].signal
                     row = " ".join(f"{t:6.3f}" for t in rings.transfer(m, truth.signal))
@@ -143,14 +143,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("kind", choices=["m2", "survey", "bilinear"])
+    parser.add_argument("kind", choices=["m2", "survey", "gains", "bilinear"])
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     if options.kind == "bilinear":
         bilinear(options.seed)
+    elif options.kind == "gains":
+        study("survey", options.seed, {"beam / 1.5": PIXELS["beam / 1.5"]}, SERIES)
     else:
-        study(options.kind, options.seed)
+        study(options.kind, options.seed, PIXELS, GAINS)
 
 
 if __name__ == "__main__":
