@@ -111,6 +111,7 @@ class Planning(Generic[O]):
 
     def __init__(self, operator: O) -> None:
         self.operator = operator
+        self.whole: Data | None = None
 
     def traits(self, observation: Observation) -> Traits:
         """Properties that other operators' bounds depend on (noise, pixels, filters).
@@ -175,6 +176,17 @@ class Planning(Generic[O]):
         samples.
         """
         return seconds, ""
+
+    @property
+    def brief(self) -> O:
+        """The operator in slices that are timed: one that repeats its work may do so less often."""
+        return self.operator
+
+    def counted(self, observations: Sequence[Observation]) -> O | None:
+        """The operator over the whole first scan with few detectors, whose data `whole` are known
+        to `finishing`: for work whose amount a shorter slice does not tell. None: not wanted.
+        """
+        return None
 
     @property
     def shortest(self) -> float:

@@ -39,6 +39,8 @@ SAMPLES = 2e7
 
 SHORTER = 4
 TIMES = 2
+FEW = 32
+"""Detectors over the whole first scan, in which work is counted, beside the outermost four."""
 LEAST_SECONDS = 4.0
 """Length of the timed slice before detectors are left out, s."""
 
@@ -110,6 +112,8 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
 
     A step's time is s_p + s_o n + r N: s_p once (outputs, finishing), s_o for each of n scans,
     r for each of N detectors x samples; `Planning.finishing` says where finishing grows with N.
+    Work that a short slice does not tell (`Planning.counted`) is counted over the whole first scan,
+    with few detectors.
     ``observations``: of the whole pipeline, every band's.
 
     Raises
@@ -124,8 +128,13 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
     seconds = min(max(SAMPLES / rate, LEAST_SECONDS, SHORTER * least), SECONDS, first.duration)
     every = max(1, math.ceil(seconds * rate / SAMPLES))
     shorter = min(max(seconds / SHORTER, least), seconds)
-    less, short = _least(file, Slice(seconds=shorter, every=every), outputs=False)
-    part, long = _least(file, Slice(seconds=seconds, every=every), outputs=True)
+    brief = _with(file, {label: planning.brief for label, planning in steps.items()})
+    less, short = _least(brief, Slice(seconds=shorter, every=every), outputs=False)
+    part, long = _least(brief, Slice(seconds=seconds, every=every), outputs=True)
+    cut = Slice(seconds=first.duration, every=max(first.n_detectors // FEW, 1))
+    for label, step in steps.items():
+        if (counted := step.counted(observations)) is not None:
+            step.whole = _least(_with(file, {label: counted}), cut, outputs=False, times=1)[0]
     few, many, samples = (
         samples_in(o) for o in (less.observations, part.observations, observations)
     )
@@ -146,12 +155,24 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
     return Timing(setup, growing, words, basis)
 
 
-def _least(file: PipelineFile, cut: Slice, outputs: bool) -> tuple[Data, dict[str, Floats]]:
-    """Data of a slice, and the least CPU seconds of each step in `TIMES` runs: once per run, once
+def _with(file: PipelineFile, operators: Mapping[str, Operator]) -> PipelineFile:
+    """The pipeline with other ``operators`` of the same labels."""
+    labels = [o.label for o in file.pipeline().operators]
+    steps = [
+        replace(s, operator=operators.get(label, s.operator))
+        for label, s in zip(labels, file.steps, strict=True)
+    ]
+    return replace(file, steps=tuple(steps))
+
+
+def _least(
+    file: PipelineFile, cut: Slice, outputs: bool, times: int = TIMES
+) -> tuple[Data, dict[str, Floats]]:
+    """Data of a slice, and the least CPU seconds of each step in so many runs: once per run, once
     per scan, and when products are finished. Outputs, if wanted, act in the first run.
     """
     least: dict[str, Floats] = {}
-    for k in range(TIMES):
+    for k in range(times):
         shown = outputs and k == 0
         steps = [s for s in file.steps if shown or not isinstance(s.operator, Output)]
         part = replace(file, steps=_cut(steps, cut))

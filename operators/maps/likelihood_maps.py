@@ -27,7 +27,7 @@ from .intensity_kernel import VALUE
 from .map_from_sums import MapFromSums
 from .map_sums import MapSums
 from .noise_record import NoiseRecord
-from .normal_equations import CompressedScans, NormalEquations, Solution, WeighedScan
+from .normal_equations import CompressedScans, NormalEquations, Solution, WeighedScan, Work
 from .parameters import LikelihoodParameters
 from .preconditioner import UNDETERMINED
 from .undetermined import TINY, Patterns, undetermined
@@ -51,12 +51,15 @@ class LikelihoodSystem:
         With the detectors of all bands.
     data
         Those of the first band.
+    work
+        For all solutions.
     """
 
     parameters: LikelihoodParameters
     parts: Sequence[tuple[Grid, Mapping[str, Any], MapSums]]
     scans: CompressedScans
     data: Data
+    work: Work = field(default_factory=Work)
     _solutions: dict[tuple[str, int | None], Solution] = field(default_factory=dict)
 
     @cached_property
@@ -105,7 +108,7 @@ class LikelihoodSystem:
     def _of(self, scans: Sequence[WeighedScan]) -> NormalEquations:
         n_stokes = 3 if self.parts[0][2].polarized else 1
         return NormalEquations(
-            scans, n_stokes, self.pixels[-1].stop, self.data.threads, self._places
+            scans, n_stokes, self.pixels[-1].stop, self.data.threads, self._places, self.work
         )
 
     def _places(self, pixels: NDArray[np.intp]) -> Floats:
@@ -227,6 +230,7 @@ class LikelihoodMaps(MapFromSums):
             self.parameters.tolerance,
             self.parameters.label,
             self.parameters.model,
+            self.system.work,
         )
         product = self.parameters.product
         key = "noise_model" if product == "map" else f"noise_model_{product}"

@@ -5,7 +5,7 @@ found.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from zonda.core.tables import html_table
 from zonda.core.types import Floats
 
 from .baseline_noise import BaselineNoise
+from .normal_equations import Work
 
 if TYPE_CHECKING:
     from zonda.core.storage.table_files import Column
@@ -41,6 +42,8 @@ class NoiseRecord:
         Residual that was wanted; the step.
     noise
         Where the models come from, in words.
+    work
+        For all solutions.
     """
 
     scans: list[str]
@@ -52,6 +55,7 @@ class NoiseRecord:
     tolerance: float
     label: str
     noise: str
+    work: Work = field(default_factory=Work)
 
     def tables(self) -> dict[str, list[Column]]:
         """Spectra and power of the modes of each scan, residuals and Ritz values."""

@@ -23,6 +23,7 @@ preconditioner. Residuals alone decide, not seconds: the map's bits depend on no
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -163,11 +164,19 @@ class Solution(NamedTuple):
 
 
 @dataclass
+class Work:
+    """Products with equation (1), right sides among them, and CPU seconds of their scans."""
+
+    products: int = 0
+    seconds: float = 0.0
+
+
+@dataclass
 class NormalEquations:
     """Equation (1) of some scans, for maps (n_stokes, n_pixels).
 
     ``threads``: scans that are worked on at a time; ``places``: coordinates (2, n) of pixels, for
-    smooth patterns.
+    smooth patterns; ``work``: is added to.
     """
 
     scans: Sequence[WeighedScan]
@@ -175,6 +184,7 @@ class NormalEquations:
     n_pixels: int
     threads: int = 1
     places: Callable[[NDArray[np.intp]], Floats] | None = None
+    work: Work = field(default_factory=Work)
 
     def __post_init__(self) -> None:
         rows = 1 if self.n_stokes == 1 else 6
@@ -337,9 +347,13 @@ class NormalEquations:
     def _added(self, of: Callable[[int], tuple[Floats, Floats]]) -> Floats:
         """Last three terms of equation (1), added up in order, from y and s ``of`` scan k."""
 
+        seconds = [0.0] * len(self.scans)
+
         def one(k: int) -> Floats:
+            begun = time.thread_time()
             y, s = of(k)
             found = self.scans[k].spread(y, s, self.n_stokes)
+            seconds[k] = time.thread_time() - begun
             for array in (y, s, self.scans[k].scan.counted):  # in files they stay there
                 forget_pages(array)
             return found
@@ -349,6 +363,8 @@ class NormalEquations:
         for k, part in enumerate(parts):
             total[:, : self.n_pixels] += part[:, : self.n_pixels]
             total[:, self._ends[k] : self._ends[k + 1]] = part[:, self.n_pixels :]
+        self.work.products += 1
+        self.work.seconds += sum(seconds)
         return total
 
 

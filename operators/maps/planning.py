@@ -18,10 +18,16 @@ from .coverage import COUNTS
 from .grid import in_frame
 from .map_layout import MapLayout
 from .maximum_likelihood import FEWEST, MaximumLikelihoodMap
+from .noise_record import NoiseRecord
+from .normal_equations import Work
 from .parameters import LONGEST
 
 HEALPY = 32_000_000
 """Bytes of the library."""
+BRIEF = 1e-2
+"""Residual at which iterations end whose time is measured."""
+MOST_COUNTED = 500_000
+"""Pixels of a map whose iterations are counted, about."""
 COMPILED = 25_000_000
 """Bytes of the compiled code of maximum-likelihood maps, and of what the allocator keeps."""
 
@@ -208,19 +214,47 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         part: Data,
         observations: Sequence[Observation],
     ) -> tuple[float, str]:
-        """Iterations of all solutions, as many as over the slice."""
-        step, label = self.operator, self.operator.label
+        """Products with the normal equations: as many as over the whole first scan with few
+        detectors, at what one takes in the slice, for each sample and for the map.
+        """
         few, many = samples_in(part.observations), samples_in(observations)
-        found = {what: text for who, what, text in part.log.figures() if who.startswith(label)}
-        number = int(found["iterations"])
-        solutions = self._solutions(part.observations[0])
-        each = seconds / max(few * number * solutions, 1)
+        number = self._work(self.whole or part).products
+        here = self._work(part)
+        each = here.seconds / max(here.products * few, 1)
+        of_map = max(seconds - here.seconds, 0.0) / max(here.products, 1)
         return (
-            seconds * many / max(few, 1),
-            f"about {number} iterations for each of {solutions} solutions, as over the slice, at"
-            f" {1e9 * each:.2g} ns a sample; more where scans overlap less or tolerance is less"
-            f" than {step.tolerance:g}",
+            number * (each * many + of_map),
+            f"about {number} products with the normal equations for"
+            f" {self._solutions(part.observations[0])} solutions, as over the whole first scan with"
+            f" few detectors, at {1e9 * each:.2g} ns a sample; more where scans overlap less",
         )
+
+    def _work(self, part: Data) -> Work:
+        """Work of all solutions in a run, of all bands."""
+        records = [p for p in part.products.values() if isinstance(p, NoiseRecord)]
+        own = {id(one.work): one.work for one in records if one.label == self.operator.label}
+        works = own.values()  # one of all bands that share modes
+        return Work(sum(one.products for one in works), sum(one.seconds for one in works))
+
+    @property
+    def brief(self) -> MaximumLikelihoodMap:
+        """Few iterations, without patterns."""
+        few = {"tolerance": max(self.operator.tolerance, BRIEF), "patterns": 0}
+        return self.operator.model_copy(update=few)
+
+    def counted(self, observations: Sequence[Observation]) -> MaximumLikelihoodMap:
+        """All iterations, on pixels so large that there are few."""
+        step = self.operator
+        layout = MapLayout(step)
+        pixels = layout.grid(layout.place(observations, {})).n_pixels
+        larger = max(1, math.ceil(math.sqrt(pixels / MOST_COUNTED)))
+        if step.nside:
+            nside = max(step.nside >> (larger - 1).bit_length(), 1)
+            return step.model_copy(update={"nside": nside})
+        pixel = step.pixel * larger
+        if step.projection == "CAR":
+            pixel = math.pi / max(round(math.pi / pixel), 1)
+        return step.model_copy(update={"pixel": pixel})
 
     def _solutions(self, observation: Observation) -> int:
         """Solutions over all samples; two halves are one."""

@@ -1,15 +1,34 @@
 """Plans of maximum-likelihood maps: what they hold, and how long they take."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import zonda
+from zonda.core.configuration.pipeline_file import parse
 from zonda.core.data import Data
+from zonda.core.plan.planner import plan
 from zonda.core.plan.planning import planning_of
+from zonda.operators.maps import planning
 from zonda.operators.maps.maximum_likelihood import MaximumLikelihoodMap
+from zonda.operators.maps.noise_record import NoiseRecord
+from zonda.operators.maps.normal_equations import NormalEquations, Work
 from zonda.plugins.checks.scenes import run, scan, scene
 
+from ...scenes import camera
+
 KEPT = []
+
+CROWDED = f"""\
+{camera(76)}operators:
+  - PointingDaisy: {{radius: 2 arcmin, speed: 50 arcsec/s, scan_duration: 60 s}}
+  - AtmosphereLayers: {{pwv: 5 mm, layers: 2}}
+  - WhiteNoise
+  - Efficiency
+  - MaximumLikelihoodMap: {{pixel: 2 arcsec, half_difference: false, tolerance: 1e-6}}
+  - SaveMap
+"""
 
 
 class Keeps(MaximumLikelihoodMap):
@@ -49,16 +68,52 @@ def test_compressed_scans_are_as_large_as_planned(stokes, baseline):
         ({"noise": "simulated"}, False, 1),
     ],
 )
-def test_the_time_of_iterations_grows_with_the_samples(how, half, solutions):
+def test_the_time_of_products_grows_with_the_samples_and_that_of_the_map_does_not(
+    how, half, solutions
+):
     step = MaximumLikelihoodMap(pixel="10 arcsec", half_difference=half, **how)
     short, long = scan(37, 3000), scan(37, 12000)
-    part = Data(scene(short.instrument), [short])
-    part.log.state(step.label, "iterations", "20")
-    seconds, words = planning_of(step).finishing(2.0, part, [long, long])
-    assert seconds == pytest.approx(2.0 * 8)
-    each = 2.0 / (37 * 3000 * 20 * solutions) * 1e9
-    assert f"about 20 iterations for each of {solutions} solutions" in words
-    assert f"{each:.2g} ns a sample" in words
+
+    def over(products, seconds):
+        part = Data(scene(short.instrument), [short])
+        work = Work(products, seconds)
+        part.products["noise_model"] = NoiseRecord(
+            [], [], [], np.zeros(0), 0, (1, 0), 1e-4, step.label, "", work
+        )
+        return part
+
+    plans = planning_of(step)
+    plans.whole = over(50, 99.0)
+    seconds, words = plans.finishing(2.0, over(10, 0.5), [long, long])
+    # 50 products, each of 8 times the slice's samples and of one map
+    assert seconds == pytest.approx(50 * (0.05 * 8 + 0.15))
+    assert f"about 50 products with the normal equations for {solutions} solutions" in words
+    assert f"{0.05 / (37 * 3000) * 1e9:.2g} ns a sample" in words
+
+
+def test_a_plan_takes_few_products_with_large_maps(monkeypatch):
+    """However small the tolerance is, and however many pixels there are. With all iterations and
+    patterns in each of the slices, there would be more than 400 products with large maps."""
+    products = []
+    added = NormalEquations._added
+
+    def counting(self, of):
+        products.append(self.n_pixels)
+        return added(self, of)
+
+    monkeypatch.setattr(NormalEquations, "_added", counting)
+    monkeypatch.setattr(planning, "MOST_COUNTED", 4000)
+    file = parse(CROWDED, name="crowded", folder=Path())
+    made = plan(file, measure=True)
+    assert made.timing is not None
+    (words,) = made.timing.basis.values()
+    large = [n for n in products if n > 4000 * 1.2]
+    assert min(large) > 20_000
+    assert len(large) < 80
+    # all iterations are counted, on large pixels
+    small = len(products) - len(large)
+    assert small > 40
+    assert f"about {small} products" in words
 
 
 def test_slices_are_long_enough_for_the_noise():
