@@ -44,6 +44,8 @@ FILLS = 40
 """Steps of the fit that fills baselines: what is left falls by the share of them that lack."""
 ITERATIONS = 40
 """Products with the covariance in the search for its leading modes."""
+ALIKE = 1e-6
+"""Share of a gradient that is not that of other modes, below which it is one of them."""
 NOWHERE = np.zeros((2, 0))
 """Places of detectors that are not known."""
 
@@ -186,7 +188,7 @@ def estimate(
     seen_in = [int(np.count_nonzero(seen_of_each[at])) for at in members(groups)]
     known = np.zeros((0, n_det)) if fixed is None else fixed
     numbers = [max(min(modes, n - 1), 0) for n in seen_in]
-    found = leading_of(groups, slow, numbers, known, places)
+    found = leading_of(groups, slow, numbers, known, places, free)
     free, modes = sum(max(min(free, modes, n - 1), 0) for n in seen_in), len(found)
     seen = np.einsum("kd,dt->kt", found, slow)
     values = np.einsum("kt,kt->k", seen, seen) / max(top - 1, 1)
@@ -241,18 +243,19 @@ def leading_of(
     numbers: Sequence[int],
     known: Floats,
     places: Floats = NOWHERE,
+    free: int = 1,
 ) -> Floats:
     """`leading` vectors of each group, as many as its number, 0 for other detectors: the first of
     all groups, then the second of all ...; some are ``known`` (k, n_det).
 
-    Where `places` are known, the second and the third are the gradients of the first, if these hold
-    more.
+    Where ``places`` are known, the gradients of the first are among three or more (see
+    `with_gradients`), of which so many are ``free``.
     """
     found = []
     for number, at in zip(numbers, members(groups), strict=True):
         own = known[(known[:, at] != 0).any(axis=1)][:number, at]
-        if places.size and number > 2 > len(own):
-            own = with_gradients(rows[at], own, places[:, at])
+        if places.size and number > 2:
+            own = with_gradients(rows[at], own, places[:, at], number, free)
         vectors = np.zeros((number, len(rows)))
         vectors[:, at] = leading(rows[at], number, own)
         found += list(enumerate(vectors))
@@ -260,18 +263,35 @@ def leading_of(
     return np.array(ordered).reshape(-1, len(rows))
 
 
-def with_gradients(rows: Floats, known: Floats, places: Floats) -> Floats:
-    """The leading vector u of ``rows`` (n_det, n), and u x and u y of the detectors' ``places`` (2,
-    n_det): what long waves of the atmosphere make. Leading vectors that are found in the noise of
-    the streams miss these by so much that the atmosphere stays in the map. ``known`` (0 or 1,
-    n_det) alone where further leading vectors of one half of the columns hold more of the others.
+def with_gradients(rows: Floats, known: Floats, places: Floats, number: int, free: int) -> Floats:
+    """Vectors (at most ``number``, n_det) that lead ``rows`` (n_det, n), of which the first are
+    ``known``: at least the leading one u. Of u x and u y of the detectors' ``places`` (2, n_det),
+    which long waves of the atmosphere make, those that are not among them come next: leading
+    vectors that are found in the noise of the streams miss these by so much that the atmosphere
+    stays in the map. Before them come further leading vectors, as long as those of one half of the
+    columns hold more of the others. Where one of the two alone is ``free``, or has room, it is that
+    along which rows change most.
     """
-    first = leading(rows, 1, known)
-    middle = (first**2 * places).sum(axis=1, keepdims=True)
-    slopes = _orthonormal(np.concatenate([first, first * (places - middle)]), first)
-    others = leading(rows[:, ::2], 3, first)
-    power = [(np.einsum("kd,dt->kt", v[1:], rows[:, 1::2]) ** 2).sum() for v in (slopes, others)]
-    return slopes if power[0] > power[1] else known
+    found = known if len(known) else leading(rows, 1, known)
+    middle = (found[:1] ** 2 * places).sum(axis=1, keepdims=True)
+    steep = found[:1] * (places - middle)
+    least = ALIKE * np.sqrt((steep**2).sum(axis=1))
+    while len(found) < number:
+        slopes = _orthonormal(np.concatenate([found, steep]), found)[len(found) :]
+        slopes = slopes[np.abs((slopes * steep).sum(axis=1)) > least]
+        last = len(found) + len(slopes)
+        if not len(slopes):
+            break
+        if len(found) < free < last or number < last:
+            seen = np.einsum("kd,dt->kt", slopes, rows)
+            axes = np.linalg.eigh(np.einsum("it,jt->ij", seen, seen))[1].T[::-1]
+            slopes = np.einsum("ij,jd->id", axes, slopes)[: number - len(found)]
+        others = leading(rows[:, ::2], len(found) + len(slopes), found)[len(found) :]
+        power = [(np.einsum("kd,dt->kt", v, rows[:, 1::2]) ** 2).sum() for v in (slopes, others)]
+        if power[0] > power[1]:
+            return np.concatenate([found, slopes])
+        found = leading(rows, len(found) + 1, found)
+    return found
 
 
 def filled(

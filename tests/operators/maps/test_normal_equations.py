@@ -304,3 +304,34 @@ def test_modes_are_gradients_unless_others_are_stronger(other):
     if not other:
         alone = leading_of(groups, rows, [3], none)
         assert ((alone @ axes) ** 2).sum(axis=1).min() < 0.97
+
+
+@pytest.mark.parametrize("free", [1, 2, 3])
+def test_gradients_stand_beside_free_modes_in_every_estimate(free):
+    """An atmosphere that changes along y alone, so that a second free mode along x would leave it in
+    the map, and beside it a pattern that is stronger (two bands of another colour): the modes of
+    the first estimate are those of a second one, with the free ones known, of other noise.
+    """
+    rng = np.random.default_rng(12)
+    n_det, n, groups = 80, 400, np.zeros(80, np.intp)
+    x, y = rng.uniform(-1, 1, (2, n_det))
+    bands = np.where(np.arange(n_det) < 40, 1.0, -1.0)
+    for number, patterns in ((3, []), (4, [bands])):
+        power = np.array([1e4, *[30.0] * len(patterns), 1.0])
+        every = np.stack([np.ones(n_det), *patterns, y])
+        rows = np.einsum("kd,kt->dt", power[:, None] * every, rng.normal(size=(len(every), n)))
+        one, two = (rows + 3 * rng.normal(size=rows.shape) for _ in range(2))
+        places, none = np.stack([x, y]), np.zeros((0, n_det))
+        first = leading_of(groups, one, [number], none, places, free)
+        again = leading_of(groups, two, [number], first[:free], places, free)
+        np.testing.assert_array_equal(again[:free], first[:free])
+        for found in (first, again):
+            np.testing.assert_allclose(found @ found.T, np.eye(number), atol=1e-12)
+            # all of both gradients, where there is room for both, but for the noise of bands' vector:
+            # 9 / (30^2 n)
+            inside = np.linalg.qr(np.stack([np.ones(n_det), *patterns, x, y]).T)[0]
+            assert ((found @ inside) ** 2).sum(axis=1).min() > 1 - 1e-4
+            if not patterns and free == 2:
+                # noise turns the axes by about 9 n_det / (power of y sqrt(n)): 0.1
+                side = found[1] - found[1].mean()
+                assert abs(np.corrcoef(side, y)[0, 1]) > 0.95
