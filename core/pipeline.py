@@ -24,6 +24,7 @@ from .machine import (
     available_threads,
     give_back_memory,
     resident_memory,
+    versions,
 )
 from .mapmaker import MapMaker, joins
 from .observation import Observation
@@ -38,7 +39,6 @@ from .signal import Signal, stream_of
 from .storage.files import check_output_folder
 from .storage.written import recording
 from .tables import html_table
-from .versions import versions
 
 
 @dataclass

@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.machine import needed
 from zonda.core.operator import Operator
 from zonda.core.pipeline import Pipeline
 from zonda.core.types import AnyFloats
-from zonda.core.versions import needed
 from zonda.operators.io.load_tod import LoadTOD
 from zonda.operators.io.save_tod import load_tod, save_tod
 from zonda.operators.io.time_ordered_data import TimeOrderedData

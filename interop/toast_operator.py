@@ -16,13 +16,13 @@ from zonda.core.configuration.diagnostics import nearest, refusal
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import DETECTOR_MASK, PROCESSING
+from zonda.core.machine import needed
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.signal import MAIN
 from zonda.core.stream import Changed, Stream, whole
 from zonda.core.types import AnyFloats
-from zonda.core.versions import needed
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
 EXTRA = "toast"

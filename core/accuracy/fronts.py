@@ -87,7 +87,7 @@ def fingerprint(file: PipelineFile) -> str:
 
 def as_json(study: Study, file: PipelineFile) -> dict[str, Any]:
     """The whole study as plain values: the stored file, and what ``--json`` prints."""
-    from ..versions import versions
+    from ..machine import versions
 
     setup = study.setup
     return {

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
-from ..versions import arithmetic
+from ..machine import arithmetic
 from .campaign_file import Say
 
 WITHOUT_INFLUENCE = frozenset({"processor", "python"})

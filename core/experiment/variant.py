@@ -147,7 +147,7 @@ class FileVariant:
         """Hash of all that its values depend on: every parameter, input files, and the sources of
         zonda and of the plugins whose steps it has.
         """
-        from ..versions import fingerprint
+        from ..machine import fingerprint
 
         found = hashlib.blake2b(fingerprint().encode(), digest_size=12)
         found.update(self.file.resolved_yaml().encode())

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from ..configuration.time import SECOND
 from ..data import Data
 from ..errors import OutputError
+from ..machine import versions
 from ..storage.files import atomic_path
 from ..storage.fits_files import header_of, joined, table_bytes, write_image
-from ..versions import versions
 from .header import exact_header
 from .map_arrays import NOISE_MODELS, MapArrays
 from .planes import ELSEWHERE, Plane, stated

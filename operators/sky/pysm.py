@@ -33,9 +33,9 @@ from zonda.core.configuration.input_paths import find
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
+from zonda.core.machine import needed
 from zonda.core.observation import Observation
 from zonda.core.types import Floats
-from zonda.core.versions import needed
 
 from .skymap import FullSky, Nside, ScanSampler, SkyMap
 

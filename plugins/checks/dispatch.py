@@ -11,8 +11,7 @@ import numpy as np
 
 import zonda
 from zonda.core.checks import Family, Measured
-from zonda.core.machine import command
-from zonda.core.versions import arithmetic
+from zonda.core.machine import arithmetic, command
 
 from .scenes import DISPATCH, camera, scene, sky_file
 

@@ -38,8 +38,7 @@ FUNCTIONS = (
 
 def description() -> dict[str, str]:
     """Describe this machine: interpreter, libraries, CPU, memory, threads."""
-    from zonda.core.machine import available_memory, available_threads
-    from zonda.core.versions import versions
+    from zonda.core.machine import available_memory, available_threads, versions
 
     found = versions()
     cpu, features = _cpu()

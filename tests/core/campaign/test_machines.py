@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from zonda.core import versions
 from zonda.core.campaign import machines
 from zonda.core.campaign.machines import Watch, differences, kind, kinds, read
+from zonda.core.machine import arithmetic
 
 SERIAL = ("--engine", "serial", "--threads", 1)
 OTHER = {"cpu": "another-cpu", "numpy": "2.3.1"}
@@ -50,7 +50,7 @@ def test_each_task_has_its_machine(bench, capsys, engine):
     assert "another kind" not in capsys.readouterr().err
     found, said = status(bench, out, capsys)
     (machine,) = found["machines"]
-    assert machine == versions.arithmetic()
+    assert machine == arithmetic()
     assert {
         "zonda",
         "numpy",
@@ -72,7 +72,7 @@ def test_another_kind_is_told_once(bench, moving, capsys):
     said = capsys.readouterr().err
     assert said.count("ran on another kind of machine or with other libraries than the first") == 1
     assert "task 3" in said
-    assert f"numpy 2.3.1 ({versions.arithmetic()['numpy']} there)" in said
+    assert f"numpy 2.3.1 ({arithmetic()['numpy']} there)" in said
     found, said = status(bench, out, capsys)
     assert [task["machine"] for task in found["tasks"]] == [0, 0, 0, 1, 1, 1]
     assert "2 kinds: maps of the two may differ in the last bits" in said
