@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_MASK, SAMPLE_MASK, TURNAROUND, samples_in
 from zonda.core.machine import needed
-from zonda.core.numerics.earth_orientation import orientation
+from zonda.core.numerics.celestial import orientation
 from zonda.core.types import Floats
 from zonda.operators.io.axismanager import SAMPLES, SCANS, UNION
 from zonda.operators.io.time_ordered_data import TimeOrderedData

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..types import Floats
-from .earth_orientation import orientation
+from .celestial import orientation
 from .sphere import unit_vectors
 
 if TYPE_CHECKING:

@@ -153,7 +153,7 @@ def earth_orientation() -> Measured:
     """how far the bundled IERS tables, predictions included, fall short of today; pip install -U
     astropy-iers-data renews them
     """
-    from zonda.core.numerics.earth_orientation import orientation
+    from zonda.core.numerics.celestial import orientation
 
     today = (
         datetime.datetime.now(datetime.UTC) - datetime.datetime(1858, 11, 17, tzinfo=datetime.UTC)

@@ -11,8 +11,7 @@ import numpy as np
 
 from zonda.core.checks import Family, Measured
 from zonda.core.configuration.time import Instant
-from zonda.core.numerics.celestial import CelestialTransform
-from zonda.core.numerics.earth_orientation import orientation
+from zonda.core.numerics.celestial import CelestialTransform, orientation
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.site import Site

@@ -14,8 +14,7 @@ import numpy as np
 from zonda.core.checks import Family
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
-from zonda.core.numerics.celestial import CelestialTransform
-from zonda.core.numerics.earth_orientation import orientation
+from zonda.core.numerics.celestial import CelestialTransform, orientation
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.operators.pointing.azimuth_scan import PointingBackAndForth

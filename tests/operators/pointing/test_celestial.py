@@ -15,8 +15,7 @@ from zonda.core.configuration.time import Instant
 from zonda.core.data import Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics import chunks
-from zonda.core.numerics.celestial import CelestialTransform
-from zonda.core.numerics.earth_orientation import orientation
+from zonda.core.numerics.celestial import CelestialTransform, orientation
 from zonda.core.numerics.projection import rotation_matrices
 from zonda.core.numerics.quaternions import from_angles
 from zonda.core.numerics.sphere import unit_vectors
@@ -306,20 +305,20 @@ def test_a_leap_second_is_a_second(reference: Any) -> None:
 
 
 def test_tables_agree_where_they_overlap() -> None:
-    from zonda.core.numerics import earth_orientation
+    from zonda.core.numerics import celestial
 
-    final, latest = earth_orientation._c04(58000, 60000), earth_orientation._finals(58000, 60000)
+    final, latest = celestial._c04(58000, 60000), celestial._finals(58000, 60000)
     assert final is not None
     # UT1 to 0.1 ms and the pole to 1 mas
     assert final == pytest.approx(latest, abs=1e-3)
-    end = next(mjd for mjd in range(60000, 90000) if earth_orientation._c04(mjd, mjd) is None)
-    assert earth_orientation._finals(end, end + 30) is not None  # a year of predictions
-    assert earth_orientation._c04(end - 1, end) is None
-    assert earth_orientation._c04(30000, 30001) is None
+    end = next(mjd for mjd in range(60000, 90000) if celestial._c04(mjd, mjd) is None)
+    assert celestial._finals(end, end + 30) is not None  # a year of predictions
+    assert celestial._c04(end - 1, end) is None
+    assert celestial._c04(30000, 30001) is None
 
 
 def test_a_table_whose_lines_differ_in_length_is_read_whole(tmp_path: Path) -> None:
-    from zonda.core.numerics.earth_orientation import _rows
+    from zonda.core.numerics.celestial import _rows
 
     def rows(lines: list[str], first: int, last: int) -> Any:
         (tmp_path / "table").write_text("# a table\n" + "".join(f"{line}\n" for line in lines))
