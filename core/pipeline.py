@@ -37,7 +37,7 @@ from .run.views import Band, View
 from .scene import Scene, WithScene
 from .signal import Signal, stream_of
 from .storage.files import check_output_folder
-from .storage.written import recording
+from .storage.output_folder import recording
 from .tables import html_table
 
 

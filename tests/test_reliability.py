@@ -345,7 +345,7 @@ def test_an_input_removed_between_two_scans(here: Path, threads: int, last: int)
 
 HOLD = """
 import sys
-from zonda.core.storage.lock import lock
+from zonda.core.storage.output_folder import lock
 with lock("out"):
     print("held", flush=True)
     sys.stdin.read()

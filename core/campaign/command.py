@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 def run(request: RunRequest) -> None:
     """``zonda run`` of pipeline files as a campaign."""
-    from ..storage.lock import lock
+    from ..storage.output_folder import lock
     from . import run as campaign
     from .prepare import Pruning
 
@@ -77,7 +77,7 @@ def resume(folder: Path, anyway: bool, same_machine: bool | None, **how: Any) ->
     from ..machine import one_blas_thread
 
     one_blas_thread()
-    from ..storage.lock import lock
+    from ..storage.output_folder import lock
     from . import run as campaign
     from .campaign_file import Job
 

@@ -32,7 +32,7 @@ from ..pipeline import Pipeline
 from ..registry import instruments, operators, operators_that, sites
 from ..scene import Scene
 from ..storage.files import check_output_folder, product_path
-from ..storage.lock import lock
+from ..storage.output_folder import lock
 from . import run
 from .campaign_file import FILE, INPUTS, Job
 from .folder import check_free

@@ -19,7 +19,7 @@ from ..configuration.units import factor_to
 from ..errors import InputError, OutputError, PipelineError, ZondaError
 from ..experiment.engines import Pool, share_out
 from ..experiment.experiment import Values
-from ..storage import written
+from ..storage import output_folder
 from ..storage.files import atomic_path, check_output_folder, write_text
 from ..tables import Table, render
 from . import trees
@@ -189,7 +189,7 @@ def begin(
     check_output_folder(folder)
     check_free(folder)
     check_links(folder)
-    old = written.earlier(folder, [path for source in sources for path in _read_by(source)])
+    old = output_folder.earlier(folder, [path for source in sources for path in _read_by(source)])
     if (folder / RESOLVED).exists() and not (old or (folder / FILE).exists()):
         say(
             f"{folder} holds products of an earlier run: those of the same names are replaced,"
@@ -207,9 +207,9 @@ def begin(
     make_way(folder, made)
     if old:
         say(f"{folder}: {plural(len(old), 'file')} of an earlier run removed")
-    written.clear(folder, old)
+    output_folder.clear(folder, old)
     made.write(folder)
-    with written.recording(folder, anew=False):
+    with output_folder.recording(folder, anew=False):
         write_sources(made, folder)
     record = Record(made, folder)
     return _work(record, pool, _watch(record, made.same_machine, say), made.tasks)
@@ -270,7 +270,7 @@ def share(
     check_output_folder(folder)
     check_links(folder)
     if not (folder / FILE).exists():
-        old = written.earlier(folder)
+        old = output_folder.earlier(folder)
         if old and not (folder / FILE).exists():  # nor did another job begin in between
             raise OutputError(
                 f"holds {plural(len(old), 'file')} of an earlier run",
@@ -280,7 +280,7 @@ def share(
         made = prepare(sources, folder, command, pruning, _progress())
         check_links(folder, made)
         publish(made, folder)
-        with written.recording(folder, anew=False):
+        with output_folder.recording(folder, anew=False):
             write_sources(made, folder)
     job = Job.read(folder)
     if (
@@ -339,7 +339,7 @@ def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> Ca
         _tell(result, watch.say)
     incomplete = {task.combination for task in job.tasks if task.number not in record.done}
     ready = [n for n in range(len(job.combinations)) if n not in incomplete | set(record.combined)]
-    with written.recording(folder, anew=False):
+    with output_folder.recording(folder, anew=False):
         Combinations(record, result, pool).carry_out(ready)
     clean(folder, job)  # of workers that were killed while they wrote
     _fail(result, len(job.tasks))
@@ -350,7 +350,7 @@ def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> Ca
             cure=f"zonda resume {folder}",
         )
     if job.figures:
-        with written.recording(folder, anew=False):
+        with output_folder.recording(folder, anew=False):
             write_table(record)
     record.finish()
     return result

@@ -35,7 +35,7 @@ from ..machine import available_memory, available_threads
 from ..pipeline import Part
 from ..run.streams import Files
 from ..storage.files import check_output_folder, discard
-from ..storage.written import recording
+from ..storage.output_folder import recording
 from . import machines, trees
 from .campaign_file import ENTRIES, Job, PlannedEntry, Task, layout_path, plural
 from .folder import Record, clean

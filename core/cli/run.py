@@ -114,8 +114,7 @@ def _run_campaign(request: RunRequest) -> None:
 def _run_one(request: RunRequest, file: PipelineFile) -> None:
     from ..plan.planner import for_run
     from ..storage.files import check_output_folder, write_text
-    from ..storage.lock import lock
-    from ..storage.written import recording
+    from ..storage.output_folder import lock, recording
 
     pipeline, settings = request.pipelines[0], request.settings
     if request.only and request.verify:

@@ -50,7 +50,7 @@ MOST_AT_ONCE = 4
 """Files that are written at a time."""
 
 RECORDS: list[Any] = []
-"""Records (`written.Record`) of the output folders of runs at work."""
+"""Records (`output_folder.Record`) of the output folders of runs at work."""
 
 
 def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:

@@ -67,7 +67,7 @@ def validate(
 
     one_blas_thread()
     from zonda.core.storage.files import check_output_folder
-    from zonda.core.storage.lock import lock
+    from zonda.core.storage.output_folder import lock
 
     from .page import summary, write
     from .rows import measured

@@ -11,11 +11,11 @@ import sys
 import pytest
 
 from zonda.core.errors import OutputError
-from zonda.core.storage.lock import NAME, lock
+from zonda.core.storage.output_folder import LOCK, lock
 
 HOLD = """
 import sys
-from zonda.core.storage.lock import lock
+from zonda.core.storage.output_folder import lock
 with lock(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
@@ -57,13 +57,13 @@ def test_a_killed_holder_leaves_a_lock_that_is_taken_over(tmp_path):
             pass
         process.kill()
         process.wait()
-    assert (tmp_path / NAME).exists()
+    assert (tmp_path / LOCK).exists()
     with lock(tmp_path):
         pass
 
 
 def test_a_file_that_nobody_holds_is_taken_over(tmp_path):
-    (tmp_path / NAME).write_text('{"host": "some')
+    (tmp_path / LOCK).write_text('{"host": "some')
     with lock(tmp_path):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -107,7 +107,7 @@ def test_nothing_but_a_regular_file_is_opened(tmp_path, kind):
     """A link in a folder that others may write to would empty the file that it names; a pipe would
     be waited for.
     """
-    place, other = tmp_path / NAME, tmp_path / "other.txt"
+    place, other = tmp_path / LOCK, tmp_path / "other.txt"
     other.write_text("somebody's")
     if kind == "pipe":
         os.mkfifo(place)

@@ -1,28 +1,37 @@
-"""Record of the files that runs write into an output folder: a later run removes those of an
-earlier one, and no other file.
+"""Output folders: the record of the files that runs write there, and one run at a time.
 
+A later run removes the files of an earlier one, and no other file.
 `zonda-files.jsonl` holds a line of JSON for each file: its path in the folder, its size and its
 time of change. The line is written before the file gets its name: a run that is killed leaves no
 product that the next one does not know.
+
+The lock of a folder is a file that the system locks (`filelock`, flock) as long as its holder
+lives: a process that is killed leaves a file that nobody holds. Where the file system knows no such
+locks the folder is refused, because no other kind tells a run that is gone from one that works.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
+import socket
 import stat
 import threading
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from ..errors import OutputError
 from . import files
 
-NAME = "zonda-files.jsonl"
+RECORD, LOCK = "zonda-files.jsonl", ".zonda-lock"
 LONGEST = 64_000_000
 """Bytes of a record that are read."""
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 
 Stamp = tuple[int, int]
 """Size [bytes] and time of change [ns] of a file."""
@@ -69,7 +78,7 @@ def clear(folder: Path, old: Iterable[Path]) -> None:
                     if parent == root:
                         break
                     parent.rmdir()
-        (root / NAME).unlink(missing_ok=True)
+        (root / RECORD).unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -127,7 +136,7 @@ class Record:
             if self._old is not None and not self._new:
                 clear(self.folder, self._old)
             self._new.add(name)
-            opened = files.open_own(self.folder / NAME, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+            opened = files.open_own(self.folder / RECORD, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
             with open(opened, "ab", buffering=0) as file:
                 file.write(line.encode())
 
@@ -137,7 +146,7 @@ class Record:
         if self._new and self._old is not None:
             with contextlib.suppress(OSError):
                 if not any(os.path.lexists(root / name) for name in self._new):
-                    (root / NAME).unlink()
+                    (root / RECORD).unlink()
         gone = [
             name
             for p in self._old or ()
@@ -168,7 +177,7 @@ def _read(folder: Path) -> dict[str, set[Stamp]]:
     """
     found: dict[str, set[Stamp]] = {}
     try:
-        with open(files.open_own(folder / NAME, os.O_RDONLY), "rb") as file:
+        with open(files.open_own(folder / RECORD, os.O_RDONLY), "rb") as file:
             lines = file.read(LONGEST).splitlines()
     except FileNotFoundError:
         return {}
@@ -179,4 +188,81 @@ def _read(folder: Path) -> dict[str, set[Stamp]]:
             os.fsencode(name)
             if inside and Path(name).parts and ".." not in Path(name).parts:
                 found.setdefault(name, set()).add((int(size), int(changed)))
+    return found
+
+
+@contextlib.contextmanager
+def lock(folder: str | os.PathLike[str], part: str = "") -> Iterator[None]:
+    """Hold a folder while the body runs.
+
+    Parameters
+    ----------
+    part
+        Name of a share of the work (a job of an array): parts of other names may run beside it, a
+        whole run may not.
+
+    Raises
+    ------
+    OutputError
+        Somebody else holds it, or the file system has no locks.
+    """
+    path = Path(folder) / (f"{LOCK}.{part}" if part else LOCK)
+    with _held(path):
+        others = [Path(folder) / LOCK] if part else sorted(Path(folder).glob(f"{LOCK}.*"))
+        for other in others:
+            if other.exists():
+                with _held(other):
+                    pass
+        yield
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Hold one lock file, which is removed after the body."""
+    holder = ""
+    if os.path.lexists(path):  # read before it is locked, which may empty it
+        with (
+            contextlib.suppress(OSError),
+            open(files.open_own(path, os.O_RDONLY), errors="replace") as file,
+        ):
+            holder = file.read(200).strip()
+    with files.writing(path):
+        taken = _take(path)
+        while taken is not None and (again := _take(path)) is not None:
+            again.release()  # the file was removed between opening and locking
+            taken.release()
+            taken = _take(path)
+    if taken is None:
+        raise OutputError(
+            f"{holder or 'another process'} is writing to this folder",
+            place=str(path.parent),
+            cure="wait for it or choose another output folder",
+        )
+    try:
+        with files.writing(path), open(files.open_own(path, os.O_WRONLY | os.O_TRUNC), "w") as file:
+            file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            path.unlink()
+        taken.release()
+
+
+def _take(path: Path) -> FileLock | None:
+    """A lock on a file, None if another holds it."""
+    found = FileLock(path, thread_local=False, fallback_to_soft=False)
+    try:
+        found.acquire(blocking=False)
+    except Timeout:
+        return None
+    except (NotImplementedError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in _NO_LOCKS:
+            raise
+        with contextlib.suppress(OSError):
+            path.unlink()
+        raise OutputError(
+            "is on a file system without locks, which keep two runs apart",
+            place=str(path.parent),
+            cure="choose a folder on a local disk, or mount the file system with locks (flock)",
+        ) from error
     return found

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from zonda.core.errors import OutputError
-from zonda.core.storage import written
+from zonda.core.storage import output_folder
 from zonda.core.storage.files import write_text
 
 
@@ -20,7 +20,7 @@ def run(folder: Path, *names: str, inputs: tuple[Path, ...] = ()) -> str:
     """Write files as a run does; the warning that it gives."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        with written.recording(folder, anew=True, inputs=inputs):
+        with output_folder.recording(folder, anew=True, inputs=inputs):
             for name in names:
                 write_text(folder / name, f"{name} of {names}")
     return "".join(str(w.message) for w in told)
@@ -30,7 +30,7 @@ def names(folder: Path) -> set[str]:
     return {
         p.relative_to(folder).as_posix()
         for p in folder.rglob("*")
-        if p.is_file() and p.name != written.NAME
+        if p.is_file() and p.name != output_folder.RECORD
     }
 
 
@@ -78,7 +78,7 @@ def test_a_file_that_is_changed_while_the_run_is_at_work_stays(tmp_path, how):
     (tmp_path / "elsewhere").mkdir()
 
     def work() -> None:
-        with written.recording(tmp_path, anew=True):
+        with output_folder.recording(tmp_path, anew=True):
             if how == "file":
                 (tmp_path / "map.fits").write_text("precious, and of the user")
             else:
@@ -142,14 +142,14 @@ def test_a_record_that_was_made_up_reaches_nothing_outside(tmp_path, name):
         "[" * 9999,
         '["a", Infinity, 1]',
     ]
-    (out / written.NAME).write_text("\n".join(lines))
+    (out / output_folder.RECORD).write_text("\n".join(lines))
     run(out, "map.fits")
     assert victim.read_text() == "precious"
 
 
 def test_a_record_that_is_a_link_is_refused(tmp_path):
     (tmp_path / "victim").write_text("precious")
-    (tmp_path / written.NAME).symlink_to("victim")
+    (tmp_path / output_folder.RECORD).symlink_to("victim")
     with pytest.raises(OutputError, match="is no regular file"):
         run(tmp_path, "map.fits")
     assert names(tmp_path) == {"victim"}
@@ -157,7 +157,7 @@ def test_a_record_that_is_a_link_is_refused(tmp_path):
 
 def test_files_outside_the_folder_are_not_recorded(tmp_path):
     out = tmp_path / "out"
-    with written.recording(out, anew=True), written.recording(out, anew=True):
+    with output_folder.recording(out, anew=True), output_folder.recording(out, anew=True):
         write_text(tmp_path / "beside.txt", "")
         write_text(out / "map.fits", "")
-    assert (out / written.NAME).read_text().count("\n") == 1
+    assert (out / output_folder.RECORD).read_text().count("\n") == 1
