@@ -30,12 +30,11 @@ from zonda.core.operator import Operator
 from zonda.core.storage.files import atomic_path
 from zonda.core.types import Floats
 
-from .array_map import ArrayMap, WorldCoordinates, checked_unit
 from .beam import PIXELS_PER_FWHM
 from .geometry import Footprint, off_the_map, position
 from .input_map import ImageMap, InputMap
 from .map_header import DOUBT, seen_twice
-from .read import read_map
+from .read import ArrayMap, WorldCoordinates, checked_unit, read_map
 from .region import Progress, no_progress
 
 if TYPE_CHECKING:
