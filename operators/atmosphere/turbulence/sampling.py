@@ -20,10 +20,9 @@ from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline
 from zonda.core.types import Floats
 
 from .geometry import ScanPlane, rim
-from .interpolation import boxes_of, extent, interpolate
 from .lattice import Turbulence
 from .lines_of_sight import LinesOfSight
-from .tiles import Swept, Tiles, Tiling, points_of
+from .tiles import Swept, Tiles, Tiling, boxes_of, extent, interpolate, points_of
 
 CELLS_IN_ALL = 2e10
 """Lattice points of one scan beyond which the run is refused."""
