@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..configuration.diagnostics import nearest
-from ..contract import fault_of_step
 from ..errors import PipelineError
-from ..operator import Operator
+from ..operator import Operator, fault_of_step
 from ..scene import Scene
 from ..signal import Signal, needed_name
 
