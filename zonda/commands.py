@@ -8,7 +8,7 @@ COMMANDS = {
     "accuracy": "zonda.core.accuracy.command:accuracy",
     "check": "zonda.core.cli.run:check",
     "compile": "zonda.core.cli.run:compile_kernels",
-    "completion": "zonda.core.cli.complete:completion",
+    "completion": "zonda.core.cli.listing:completion",
     "compare": "zonda.plugins.commands.compare:compare",
     "doctor": "zonda.plugins.commands.doctor:doctor",
     "new": "zonda.plugins.commands.new:new",

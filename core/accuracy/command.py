@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ..cli import complete
+from ..cli import listing
 from ..command_options import set_option
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ NOT_MET = 1
 
 
 @click.command()
-@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
+@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=listing.complete_pipelines)
 @click.option(
     "--metric",
     default="map_rms",

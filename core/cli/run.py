@@ -20,7 +20,7 @@ from ..command_options import (
     only_option,
     set_option,
 )
-from . import complete
+from . import listing
 
 if TYPE_CHECKING:
     from ..configuration.loaded import Accuracy
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     metavar="FILE_OR_NAME...",
     nargs=-1,
     required=True,
-    shell_complete=complete.pipelines,
+    shell_complete=listing.complete_pipelines,
 )
 @set_option
 @keep_option
@@ -207,7 +207,9 @@ def _verify(
 
 
 @click.command("compile")
-@click.argument("names", metavar="[FILE_OR_NAME]...", nargs=-1, shell_complete=complete.pipelines)
+@click.argument(
+    "names", metavar="[FILE_OR_NAME]...", nargs=-1, shell_complete=listing.complete_pipelines
+)
 def compile_kernels(names: tuple[str, ...]) -> None:
     """Compile the kernels of pipelines, by default of all shipped ones, so that no later run does.
 
@@ -240,7 +242,7 @@ def compile_kernels(names: tuple[str, ...]) -> None:
 
 
 @click.command()
-@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
+@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=listing.complete_pipelines)
 @set_option
 def check(pipeline: str, settings: tuple[str, ...]) -> None:
     """Check a pipeline file without running it.

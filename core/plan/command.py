@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
-from ..cli import complete
+from ..cli import listing
 from ..command_options import drop_option, keep_option, only_option, set_option
 
 
 @click.command()
-@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=complete.pipelines)
+@click.argument("pipeline", metavar="FILE_OR_NAME", shell_complete=listing.complete_pipelines)
 @set_option
 @keep_option
 @drop_option

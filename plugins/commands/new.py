@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zonda.core.cli import complete
+from zonda.core.cli import listing
 
 from .arguments import checked
 
@@ -46,12 +46,12 @@ def new() -> None:
     default="mustang2",
     show_default=True,
     metavar="NAME",
-    shell_complete=complete.instruments,
+    shell_complete=listing.complete_instruments,
 )
 @click.option(
     "--site",
     metavar="NAME",
-    shell_complete=complete.sites,
+    shell_complete=listing.complete_sites,
     help="[default: the telescope's own]",
 )
 @click.option(

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from zonda.core.cli import complete
+from zonda.core.cli import listing
 from zonda.core.command_options import set_option
 
 
@@ -16,18 +16,18 @@ from zonda.core.command_options import set_option
     "pipeline",
     metavar="[FILE_OR_NAME]",
     required=False,
-    shell_complete=complete.pipelines,
+    shell_complete=listing.complete_pipelines,
 )
 @click.option(
     "--instrument",
     metavar="NAME",
-    shell_complete=complete.instruments,
+    shell_complete=listing.complete_instruments,
     help="Without a pipeline: the camera.",
 )
 @click.option(
     "--site",
     metavar="NAME",
-    shell_complete=complete.sites,
+    shell_complete=listing.complete_sites,
     help="Without a pipeline: where it stands.",
 )
 @click.option(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zonda.core.cli import complete
+from zonda.core.cli import listing
 
 from .arguments import draw, picture
 
@@ -31,7 +31,7 @@ def show() -> None:
 
 
 @show.command()
-@click.argument("name", shell_complete=complete.instruments)
+@click.argument("name", shell_complete=listing.complete_instruments)
 @picture("The picture.  [default: out/show/NAME.png]")
 def instrument(name: str, output: Path | None) -> None:
     """Print what an instrument is, and draw its focal plane (also as PDF or SVG).

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from zonda.core.cli import complete
+from zonda.core.cli import listing
 
 from .arguments import checked, draw, instant_of, picture, place_of
 
@@ -31,7 +31,7 @@ class WithDefault(click.Group):
         """Sites beside the commands."""
         return [
             *super().shell_complete(ctx, incomplete),
-            *complete.sites(ctx, self.commands["show"].params[0], incomplete),
+            *listing.complete_sites(ctx, self.commands["show"].params[0], incomplete),
         ]
 
 
@@ -47,7 +47,7 @@ def weather() -> None:
 SIGNS = {"ignore_unknown_options": True}
 """A southern latitude begins with a minus."""
 
-_site = click.argument("site", metavar="SITE", shell_complete=complete.sites)
+_site = click.argument("site", metavar="SITE", shell_complete=listing.complete_sites)
 _time = click.option(
     "--time",
     metavar="TIME",
@@ -63,7 +63,7 @@ _time = click.option(
     "instruments",
     multiple=True,
     metavar="NAME",
-    shell_complete=complete.instruments,
+    shell_complete=listing.complete_instruments,
     help="Whose bands to show; may be repeated.",
 )
 @click.option(

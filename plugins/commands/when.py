@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zonda.core.cli import complete
+from zonda.core.cli import listing
 
 from .arguments import checked, draw, instant_of, place_of
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option(
     "--site",
     metavar="SITE",
-    shell_complete=complete.sites,
+    shell_complete=listing.complete_sites,
     help="Registered name, or 'latitude, longitude, altitude'.  [required]",
 )
 @click.option(
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     "instruments",
     multiple=True,
     metavar="NAME",
-    shell_complete=complete.instruments,
+    shell_complete=listing.complete_instruments,
     help="Whose transmission to show; may be repeated.",
 )
 @click.option(
