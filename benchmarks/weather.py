@@ -42,7 +42,7 @@ def main() -> None:
         print(f"{name:40s} {1e3 * min(float(v) for v in values):8.2f} ms")
 
     from zonda.core.registry import instruments, sites
-    from zonda.operators.atmosphere.weather.summary import pwv_by_month
+    from zonda.operators.atmosphere.weather.climatology import pwv_by_month
 
     start = perf_counter()
     pwv_by_month(sites.create("chajnantor"))

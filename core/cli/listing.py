@@ -1,5 +1,5 @@
-"""``zonda plugins``, ``pipelines``, ``schema`` and ``completion``: names of what there is, and their
-completion by a shell, without importing components.
+"""Names of what there is (``zonda plugins``, ``pipelines``, ``schema``) and their completion by a
+shell, without importing components.
 """
 
 from __future__ import annotations

@@ -18,9 +18,9 @@ from zonda.core.tables import aligned
 from zonda.core.types import Floats
 from zonda.operators.atmosphere.weather import climatology
 from zonda.operators.atmosphere.weather.bands import BandAtmosphere
+from zonda.operators.atmosphere.weather.climatology import MONTHS
 from zonda.operators.atmosphere.weather.profiles import PWV_MAX
 from zonda.operators.atmosphere.weather.radiative_transfer import ELEVATION_MIN
-from zonda.operators.atmosphere.weather.summary import MONTHS
 
 if TYPE_CHECKING:
     from zonda.core.configuration.target import Target

@@ -8,13 +8,25 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from zonda.core.cli import listing
 
 from .arguments import checked, draw, instant_of, picture, place_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from zonda.core.configuration.time import Instant
+    from zonda.core.instrument import Band
+    from zonda.core.site import Site
+    from zonda.operators.atmosphere.weather.climatology import PwvByMonth
+    from zonda.operators.atmosphere.weather.profiles import Profile
+
+HEIGHTS = (0.0, 250.0, 500.0, 1e3, 2e3, 3e3, 5e3, 8e3, 12e3, 20e3)
+"""m above the site, in the table."""
 
 
 class WithDefault(click.Group):
@@ -105,7 +117,7 @@ def show(
     from zonda.core import registry, weather
     from zonda.core.configuration.units import Unit
     from zonda.core.storage.files import product_path
-    from zonda.operators.atmosphere.weather import summary
+    from zonda.operators.atmosphere.weather.climatology import pwv_by_month
     from zonda.operators.atmosphere.weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
     from zonda.operators.atmosphere.weather.sources import profile_of
 
@@ -127,12 +139,12 @@ def show(
     )
     bands = list(dict.fromkeys(camera.band for camera in cameras))
     air = profile_of(model, place, when, seed)
-    parts, water = [summary.place_lines(place, when, air), summary.profile_lines(air)], None
+    parts, water = [place_lines(place, when, air), profile_lines(air)], None
     if place.climatology is not None:
-        water = summary.pwv_by_month(place, when.datetime.year)
-        parts.append(summary.pwv_lines(water))
+        water = pwv_by_month(place, when.datetime.year)
+        parts.append(pwv_lines(water))
     if bands:
-        parts.append(summary.band_lines(air, bands, angle))
+        parts.append(band_lines(air, bands, angle))
     click.echo("\n\n".join("\n".join(lines) for lines in parts))
 
     from zonda.plugins.commands.weather_plots import weather_figure
@@ -172,3 +184,83 @@ def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
     with atomic_path(output) as temporary:
         retrieve(place, when, hours, temporary)
     click.echo(f"{output}")
+
+
+def place_lines(site: Site, time: Instant, profile: Profile) -> list[str]:
+    """Lines about place, time and source of the profile."""
+    where = (
+        f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg,"
+        f" {site.altitude:g} m"
+    )
+    head = f"{site.name}: {site.description}" if site.description else site.name
+    return [head, f"{where}; {time}", *(f"{what}: {text}" for what, text in profile.stated)]
+
+
+def profile_lines(profile: Profile) -> list[str]:
+    """A table of the profile; the wind is that which blows, coming from a direction."""
+    import numpy as np
+
+    from zonda.core.tables import aligned
+
+    air = profile.at(HEIGHTS)
+    columns = (
+        ("above site", "m", ".0f", air.height),
+        ("pressure", "hPa", ".1f", air.pressure / 100),
+        ("temperature", "K", ".1f", air.temperature),
+        ("vapour", "g/m3", ".3g", air.vapour_density * 1e3),
+        ("wind", "m/s", ".1f", np.hypot(air.wind_east, air.wind_north)),
+        ("from", "deg", ".0f", np.degrees(np.arctan2(-air.wind_east, -air.wind_north)) % 360),
+    )
+    heads, units, forms, values = zip(*columns, strict=True)
+    rows = [
+        [f"{x:{form}}" for x, form in zip(row, forms, strict=True)]
+        for row in zip(*values, strict=True)
+    ]
+    return aligned([units, *rows], heads, ">", indent="  ")
+
+
+def pwv_lines(water: PwvByMonth) -> list[str]:
+    """A table of the PWV by month and hour."""
+    from zonda.core.tables import aligned
+    from zonda.operators.atmosphere.weather.climatology import HOURS, MONTHS, QUANTILES
+
+    head = ("", *(f"{hour:02d}h" for hour in HOURS), "|", *(f"{100 * q:g} %" for q in QUANTILES))
+    rows = [
+        (month, *map(_short, medians), "|", *map(_short, quantiles))
+        for month, medians, quantiles in zip(MONTHS, water.median, water.quantiles, strict=True)
+    ]
+    title = "PWV [mm]: median by hour (UTC), and quantiles of the month"
+    return [title, *aligned(rows, head, "<>")]
+
+
+def band_lines(profile: Profile, bands: Iterable[Band], elevation: float) -> list[str]:
+    """Emission and transmission of bands at several PWVs and an elevation [rad]."""
+    from zonda.core.tables import aligned
+    from zonda.operators.atmosphere.weather.bands import BandAtmosphere
+    from zonda.operators.atmosphere.weather.profiles import PWV_MAX, pwv_steps
+
+    steps = pwv_steps(profile)
+    at = f"at an elevation of {math.degrees(elevation):g} deg"
+    lines = [f"{at}: emission of the atmosphere (background 0 K), transmission, opacity"]
+    for band in bands:
+        seen = BandAtmosphere(band, profile, min(max(*steps, 1e-4) * 1.01, PWV_MAX))
+        low, high = (edge / 1e9 for edge in band.edges)
+        lines.append(f"  {band.name} ({low:.6g} to {high:.6g} GHz)")
+        rows = []
+        for pwv in steps:
+            passed = float(seen.transmission(pwv, elevation))
+            rows.append(
+                (
+                    f"PWV {_short(pwv)} mm:",
+                    f"{float(seen.emission(pwv, elevation)):.2f} K_RJ,",
+                    f"{passed:{'.4f' if passed >= 1e-3 else '.1e'}},",
+                    f"{float(seen.opacity(pwv, elevation)):.4g}",
+                    "<" if pwv == profile.pwv else "",
+                )
+            )
+        lines += aligned(rows, align=">", indent="    ")
+    return lines
+
+
+def _short(pwv: float) -> str:
+    return f"{pwv * 1e3:.2f}" if pwv < 10e-3 else f"{pwv * 1e3:.1f}"

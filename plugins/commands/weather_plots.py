@@ -12,14 +12,9 @@ import numpy as np
 
 from zonda.core.canvas import PALE, SEQUENCE, log_labels, new_figure
 from zonda.core.types import Floats
+from zonda.operators.atmosphere.weather.climatology import HOURS, MONTHS, QUANTILES, PwvByMonth
+from zonda.operators.atmosphere.weather.profiles import pwv_steps
 from zonda.operators.atmosphere.weather.radiative_transfer import spectrum
-from zonda.operators.atmosphere.weather.summary import (
-    HOURS,
-    MONTHS,
-    QUANTILES,
-    PwvByMonth,
-    pwv_steps,
-)
 
 from .visibility import HORIZON, HOUR, Month, Seen, solar_offset
 

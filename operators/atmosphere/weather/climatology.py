@@ -13,6 +13,7 @@ from 1 January, hour is UTC.
 from __future__ import annotations
 
 from calendar import isleap
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.storage.files import own_data
 from zonda.core.types import Floats
@@ -30,13 +32,16 @@ from .profiles import Profile, check_pwv, on_heights
 from .radiative_transfer import VAPOUR_GAS_CONSTANT
 
 if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
     from zonda.core.site import Site
 
 CLIMATOLOGY = Path(__file__).parent.parent / "data" / "climatology.npz"
 
 YEARS = (1940, 2100)
 """Years for which the climatology, of 15 recent ones, is taken: ERA5 begins with the first."""
+HOURS = tuple(range(0, 24, 3))
+"""UTC."""
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 
 
 def profile(site: Site, time: Instant, pwv: float | None = None) -> Profile:
@@ -158,3 +163,28 @@ def harmonics(day: float, hour: float) -> Floats:
         for x, n in ((a, 4), (b, 2))
     )
     return np.outer(annual, diurnal).ravel()
+
+
+@dataclass(frozen=True)
+class PwvByMonth:
+    """PWV [m] on the 15th of each month: ``median`` (12, n_hour), and the mean over the hours of
+    ``quantiles`` (12, 5).
+    """
+
+    median: Floats
+    quantiles: Floats
+
+
+def pwv_by_month(site: Site, year: int = 2023) -> PwvByMonth:
+    """PWV by month, from the site's climatology. Raises `InputError` where there is none."""
+    median, quantiles = np.empty((12, len(HOURS))), np.zeros((12, len(QUANTILES)))
+    for month in range(12):
+        for k, hour in enumerate(HOURS):
+            law = profile(
+                site,
+                Instant.parse(f"{year}-{month + 1:02d}-15T{hour:02d}:00Z"),
+            ).distribution
+            assert law is not None  # the climatology has spreads
+            median[month, k] = law.median
+            quantiles[month] += np.array([law.at(q) for q in QUANTILES]) / len(HOURS)
+    return PwvByMonth(median, quantiles)

@@ -388,3 +388,17 @@ def _layer_mean(pressure: Floats, mixing_ratio: Floats) -> Floats:
     )  # (1 + power) x thickness; 0 where the vapour pressure does not change
     share = np.where(x == 0, 1.0, -np.expm1(-x) / np.where(x == 0, 1.0, x))
     return np.asarray(low * pressure[:-1] * thickness * share / (pressure[:-1] - pressure[1:]))
+
+
+def pwv_steps(profile: Profile) -> list[float]:
+    """The PWVs [m] for which spectra are shown: the profile's own among round values from very dry
+    to very wet there.
+    """
+    law = profile.distribution
+    if not profile.pwv > 0:
+        return [0.0, 1e-3]
+    low, high = profile.pwv / 3, min(3 * profile.pwv, PWV_MAX)
+    if law is not None:
+        low, high = law.at(0.05), law.at(0.95)
+    rounded = {float(f"{low * (high / low) ** (k / 3):.1g}") for k in range(4)}
+    return sorted({profile.pwv, *(p for p in rounded if abs(p / profile.pwv - 1) > 0.2)})

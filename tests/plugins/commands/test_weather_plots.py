@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from zonda.core import registry, weather
 from zonda.core.configuration.time import Instant
 from zonda.operators.atmosphere.weather.absorption import absorption_table
+from zonda.operators.atmosphere.weather.climatology import pwv_by_month
 from zonda.operators.atmosphere.weather.sources import profile_of
-from zonda.operators.atmosphere.weather.summary import pwv_by_month
 from zonda.plugins.commands.weather_plots import LINES, plot_spectrum, spread, weather_figure
 
 
