@@ -10,7 +10,11 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import HealthCheck, settings
 
-from zonda.core.machine import cache_folder
+from zonda.core.machine import cache_folder, one_blas_thread
+
+# as `zonda` does, before numpy is imported: threads of BLAS would wait for each other
+one_blas_thread()
+
 from zonda.core.registry import registries
 
 # kernels are compiled once, not in every session
