@@ -39,11 +39,20 @@ operators:
 
 
 STREAMS = ["signal", "signal/quiet"]
+PLATE = (
+    ("  knee:", "  polarization: pairs\n  knee:"),
+    ("  - AtmosphereLayers", "  - HalfWavePlate: {frequency: 2 Hz}\n  - AtmosphereLayers"),
+    ("{pixel: 3 arcsec}", "{pixel: 3 arcsec, stokes: IQU}"),
+)
 
 
-def file_of(folder, campaign="null"):
+def file_of(folder, campaign="null", changes=()):
     path = Path(folder) / f"{hashlib.md5(campaign.encode()).hexdigest()}.yaml"
-    path.write_text(YAML.replace("CAMPAIGN", campaign))
+    text = YAML.replace("CAMPAIGN", campaign)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
     return path
 
 
@@ -56,8 +65,8 @@ def digest(data):
     return found.hexdigest()
 
 
-def run(folder, **how):
-    file = load(str(file_of(folder)), ())
+def run(folder, changes=(), **how):
+    file = load(str(file_of(folder, changes=changes)), ())
     return file.pipeline().run(file.scene(), **{"threads": 1, "output": folder / "out", **how})
 
 
@@ -123,19 +132,23 @@ def test_room_in_memory_is_given_once():
 PROGRAM = """
 import sys
 from pathlib import Path
-from tests.operators.maps.test_likelihood_bits import digest, run
-print(digest(run(Path(sys.argv[1]), threads=int(sys.argv[2]))))
+from tests.operators.maps.test_likelihood_bits import PLATE, digest, run
+changes = PLATE if sys.argv[3] == "IQU" else ()
+print(digest(run(Path(sys.argv[1]), changes, threads=int(sys.argv[2]))))
 """
 
 
 @pytest.mark.nightly
-def test_threads_of_blas_change_no_bit(ample, tmp_path):
+@pytest.mark.parametrize("stokes", ["I", "IQU"])
+def test_threads_of_blas_change_no_bit(ample, tmp_path, stokes):
+    """Of I, and of I, Q and U with a half-wave plate."""
+    here = ample[0] if stokes == "I" else digest(run(tmp_path, PLATE))
     runs = []
     for threads in ("1", "2"):
         folder = tmp_path / threads
         folder.mkdir()
         more = {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
-        command = [sys.executable, "-W", "ignore", "-c", PROGRAM, str(folder), threads]
+        command = [sys.executable, "-W", "ignore", "-c", PROGRAM, str(folder), threads, stokes]
         runs.append(
             subprocess.Popen(
                 command,
@@ -145,7 +158,7 @@ def test_threads_of_blas_change_no_bit(ample, tmp_path):
                 text=True,
             )
         )
-    assert [one.communicate()[0].split()[-1] for one in runs] == [ample[0]] * 2
+    assert [one.communicate()[0].split()[-1] for one in runs] == [here] * 2
 
 
 def planes(folder):
