@@ -93,7 +93,7 @@ class Scan:
         data = zonda.Pipeline(
             [*steps, zonda.SaveTOD(), map_makers.Maker(**how)], runs=map_makers.SIGNALS
         ).run(scene, threads=1, keep=["signal", "signal/rest"], output=folder)
-        equations, solution, _ = map_makers.KEPT
+        equations, solution, *_ = map_makers.KEPT
         ((scan, _),) = equations.scans
         pixel = np.repeat(scan.pixel, scan.samples).reshape(scan.shape[0], scan.n_samples)
         pixel[pixel == equations.n_pixels] = -1
@@ -135,11 +135,16 @@ def compare(peers: dict[str, str], options: argparse.Namespace, folder: Path) ->
         for job, (python, script, arguments) in jobs.items():
             reports[job].append(json.loads(call(python, script, arguments, folder, options.limit)))
     unit = iteration(reports["zonda"])
-    print(f"{'':22s} ns a sample and iteration, over zonda's, iterations needed")
+    print(
+        f"{'':22s} ns a sample and iteration, over zonda's, iterations needed, set-up ns a sample"
+    )
     for job, found in reports.items():
         one = iteration(found)
         needed, version = (found[0].get(key, "") for key in ("needed", "version"))
-        print(f"{job:22s} {one / total * 1e9:6.1f} {one / unit:6.1f} {needed:>4} {version}")
+        setup = min(report.get("setup", np.nan) for report in found) / total * 1e9
+        print(
+            f"{job:22s} {one / total * 1e9:6.1f} {one / unit:6.1f} {needed:>4} {setup:6.0f} {version}"
+        )
     product = scan.data["rest/map"]
     rings = map_makers.Rings(product, map_makers.SCALES["m2"])
     for modes in MODES if "pysanepic" in peers else ():
