@@ -46,6 +46,8 @@ ITERATIONS = 40
 """Products with the covariance in the search for its leading modes."""
 ALIKE = 1e-6
 """Share of a gradient that is not that of other modes, below which it is one of them."""
+LEAST_LEFT = 0.1
+"""Share of a detector's white noise that modes leave, from which its level is told."""
 NOWHERE = np.zeros((2, 0))
 """Places of detectors that are not known."""
 
@@ -208,8 +210,10 @@ def estimate(
         shared[k] = np.maximum(amplitude[:, at].mean(axis=1) - own[k], 0.0)
     upper = powers[:, powers.shape[1] // 2 :]
     rest_of_each = upper - np.einsum("kd,kt->dt", found, _projected(upper, found))
-    left = np.maximum(has - (found**2).sum(axis=0), 0.1)  # of its white noise, without the modes
-    fast = np.where(seen_of_each[:, 0], (np.abs(rest_of_each) ** 2).mean(axis=1) / left, 1.0)
+    left = has - (found**2).sum(axis=0)  # of its white noise, without the modes
+    fast = np.ones(n_det)
+    told = (seen_of_each[:, 0] > 0) & (left > LEAST_LEFT)
+    fast[told] = (np.abs(rest_of_each[told]) ** 2).mean(axis=1) / left[told]
     share = max(seen_of_each.max(), 1) / n_base
     middle = (edges[:-1] + edges[1:] - 1) / 2 / n_base * rate / length
     return BaselineNoise(

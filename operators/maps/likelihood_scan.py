@@ -236,9 +236,10 @@ class LikelihoodScan:
         place = f"{place}, {observation.name}"
         if np.isnan(white).all():
             raise PipelineError(
-                "no sample counts: all are flagged or not finite",
+                "no sample counts: all are flagged, not finite or beyond the map",
                 place=place,
-                cure="leave this scan out, or look at the flags of its samples",
+                cure="leave this scan out, or look at the flags of its samples and at width and"
+                " centre of the map",
             )
         if (white <= 0).any():
             raise PipelineError(

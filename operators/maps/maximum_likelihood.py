@@ -109,18 +109,20 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
                 place=place,
                 cure=f"set baseline: {4 / observation.sample_rate:.2g} s, or longer",
             )
-        self._need_baselines(-(-observation.n_samples // length), seconds, place)
+        n_samples = observation.n_samples
+        self._need_baselines(-(-n_samples // length), n_samples, seconds, place)
         return length
 
-    def _need_baselines(self, number: int, seconds: float, place: str) -> None:
-        needed = FEWEST + self.trend
+    def _need_baselines(self, number: int, n_samples: int, seconds: float, place: str) -> None:
+        needed, cure = FEWEST + self.trend, "make the map with BinMap"
         if number < needed:
+            if n_samples >= 2 * needed:  # of two samples each
+                cure = f"set a shorter baseline, of which a scan has {needed} or more; or {cure}"
             raise PipelineError(
-                f"the scan has samples in {number} baselines of {seconds:.3g} s, too few to find"
-                " its noise from",
+                f"the scan has samples in {number} of the {needed} baselines of {seconds:.3g} s"
+                " that its noise is found from",
                 place=place,
-                cure=f"set a shorter baseline, of which a scan has {needed} or more;"
-                " or make the map with BinMap",
+                cure=cure,
             )
 
     def prepare(self, observation: Observation) -> BandScan:  # type: ignore[override]
@@ -154,7 +156,8 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         white = scan.white(self.label)
         place = f"{self.label}, {observation.name}"
         number = int(np.count_nonzero(scan.found.counted.any(axis=0)))
-        self._need_baselines(number, self.baseline_of(observation), place)
+        seconds = self.baseline_of(observation)
+        self._need_baselines(number, observation.n_samples, seconds, place)
         for _ in range(WHITE_LEVELS):
             scan.noise = scan.estimate(white, self)
             white = np.where(scan.noise.fast < STEADY, white * scan.noise.fast, white)

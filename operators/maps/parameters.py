@@ -230,7 +230,8 @@ class LikelihoodParameters(MapParameters):
     """Modes that detectors share, each with a spectrum of its own. 0: baselines of independent
     detectors (destriping with a noise prior)."""
     free: int = Field(1, ge=0, le=20)
-    """Number of modes without weight at any frequency, within baselines too."""
+    """Number of modes without weight at any frequency, within baselines too. Without modes
+    there are none."""
     group: Literal["band", "wafer", "all"] = "band"
     """The detectors that share modes: those of a band, of each wafer, which then has `modes` and
     `free` of its own, or of all bands of the camera, whose maps are then found together."""
@@ -261,6 +262,8 @@ class LikelihoodParameters(MapParameters):
 
     @model_validator(mode="after")
     def _of_likelihood(self) -> LikelihoodParameters:
+        if "free" not in self.model_fields_set:
+            self.__dict__["free"] = min(self.free, self.modes)
         if self.free > self.modes:
             raise ValueError(f"free: {self.free} of {self.modes} modes; set modes to {self.free}")
         if self.contents == "hits" or self.weights == "uniform":

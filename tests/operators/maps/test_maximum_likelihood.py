@@ -378,6 +378,11 @@ def test_parameters_that_do_not_go_together(how, place):
         MaximumLikelihoodMap(**how)
 
 
+def test_without_modes_none_is_free():
+    assert MaximumLikelihoodMap(modes=0).free == 0
+    assert MaximumLikelihoodMap(modes=2).free == 1
+
+
 POINTED = [zonda.PointingDaisy(radius="3 arcmin", speed="50 arcsec/s", scan_duration="50 s")]
 FORMED = [*POINTED, zonda.WhiteNoise(), zonda.Efficiency()]
 SHIPPED = [
@@ -577,7 +582,7 @@ def test_baselines_follow_from_the_scan():
 
 
 def test_few_detectors_and_many_modes_keep_the_level_of_white_noise():
-    for n_det, modes in ((1, 3), (2, 2), (37, 20)):
+    for n_det, modes in ((1, 3), (2, 2), (7, 20), (37, 20)):
         o = scan(n_det, 6000, radius=3.0)
         noise = SIGMA * np.random.default_rng(13).normal(size=(n_det, o.n_samples))
         found = mapped(o, noise, modes=modes, free=0)
@@ -595,26 +600,30 @@ def test_a_detector_without_samples_has_no_part():
     assert (found.signal / found.noise)[ok].std() < 1.5
     with pytest.raises(PipelineError, match="no sample counts"):
         mapped(o, np.full_like(noise, np.nan))
+    with pytest.raises(PipelineError, match="beyond the map") as caught:
+        mapped(o, noise, width="1 arcmin", centre="12h -30d")
+    assert "centre" in caught.value.cure
 
 
 @pytest.mark.parametrize(
     ("n", "how", "cause", "cure"),
     [
-        (10, {}, "in 1 baselines", "shorter baseline"),
-        (300, {}, "in 15 baselines", "shorter baseline"),
-        (6000, {"baseline": "5 ms"}, "one sample", "0.04 s"),
+        (10, {}, "in 1 of the 17 baselines", "make the map with BinMap"),
+        (33, {"baseline": "0.02 s"}, "in 17 of the 18 baselines", "make the map with BinMap"),
+        (300, {}, "in 15 of the 17 baselines", "set a shorter baseline, of which a scan has 17"),
+        (6000, {"baseline": "5 ms"}, "one sample", "set baseline: 0.04 s"),
     ],
 )
 def test_scans_that_tell_too_little_are_refused(n, how, cause, cure):
     o = scan(5, n, radius=3.0)
     noise = SIGMA * np.random.default_rng(15).normal(size=(5, n))
     with pytest.raises(PipelineError, match=cause) as caught:
-        mapped(o, noise, **how)
-    assert cure in caught.value.cure
+        mapped(o, noise, trend=2 if n == 33 else 1, **how)
+    assert caught.value.cure.startswith(cure)
 
 
 def test_a_scan_of_which_little_counts_is_refused():
     o = scan(5, 6000, radius=3.0)
     o.flags[100:] = 2
-    with pytest.raises(PipelineError, match="in 5 baselines"):
+    with pytest.raises(PipelineError, match="in 5 of the 17 baselines"):
         mapped(o, SIGMA * np.random.default_rng(15).normal(size=(5, 6000)))
