@@ -87,9 +87,9 @@ class CalibratedSignal(Operator):
     and nothing else is provided up to there. It is not one of the pipeline's own steps.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({MAIN})
-    linear: ClassVar[bool] = True
-    knows_means: ClassVar[bool] = True
+    provides = frozenset({MAIN})
+    linear = True
+    knows_means = True
 
     _reads: frozenset[str] = PrivateAttr(frozenset({"sky"}))
     _means: FieldSums = PrivateAttr(default_factory=FieldSums)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 from pydantic import PrivateAttr
 
@@ -67,9 +67,9 @@ class DoneBefore(Operator):
 class KeptSignals(Operator):
     """The scans of a run, and the signals that it kept."""
 
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight", MAIN})
-    linear: ClassVar[bool] = True
-    knows_means: ClassVar[bool] = True
+    provides = frozenset({"boresight", MAIN})
+    linear = True
+    knows_means = True
 
     _data: Data = PrivateAttr()
 

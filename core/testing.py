@@ -15,7 +15,7 @@ import dataclasses
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ N_DETECTORS, N_SAMPLES, RATE = 37, 3 * TILE_SAMPLES + 321, 50.0
 class Points(Operator):
     """Points at the made-up scan."""
 
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides = frozenset({"boresight"})
 
     def observe(self, data: Data) -> None:
         data.observations.append(made_up_scan())
@@ -58,9 +58,9 @@ class Given(Operator):
     ``mean`` names one that has a mean of some 30 K, ``beside`` it or in it.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset(STREAMS)
-    knows_means: ClassVar[bool] = True
+    requires = frozenset({"boresight"})
+    provides = frozenset(STREAMS)
+    knows_means = True
     mean: str = ""
     beside: bool = True
 

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Mapping
 from dataclasses import replace
 from importlib.util import find_spec
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import Field, JsonValue, model_validator
@@ -42,10 +42,10 @@ class ToastOperator(Operator):
     scene's seed.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    knows_means: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+    requires = frozenset({"signal"})
+    provides = frozenset({"signal"})
+    knows_means = True
+    couples = "all"
 
     operator: str
     """Its name in `toast.ops`, e.g. PolyFilter, GroundFilter, CommonModeFilter."""

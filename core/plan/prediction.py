@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from tempfile import TemporaryDirectory
-from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -193,7 +192,7 @@ class Slice(Operator):
     """Keep the first samples of the first observation, and every so many detectors: random numbers
     are addressed, not drawn in order, so that all runs over a slice see the same."""
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    requires = frozenset({"boresight"})
     seconds: float = Field(SECONDS, gt=0)
     """Length of the observation, s."""
     every: int = Field(1, ge=1)

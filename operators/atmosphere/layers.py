@@ -34,7 +34,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -219,9 +219,9 @@ class AtmosphereLayers(LayerParameters):
     ``path_delay`` (m of excess path, non-dispersive).
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    on_request: ClassVar[frozenset[str]] = frozenset({"pwv", "opacity", "path_delay"})
-    knows_means: ClassVar[bool] = True
+    requires = frozenset({"boresight"})
+    on_request = frozenset({"pwv", "opacity", "path_delay"})
+    knows_means = True
 
     _models: Models = PrivateAttr(default_factory=Models)
 

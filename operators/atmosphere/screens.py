@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,10 +209,10 @@ class AtmosphereScreens(Output):
     campaign has none: its log says so.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    optional: ClassVar[frozenset[str]] = frozenset({"atmosphere"})
-    provides: ClassVar[frozenset[str]] = frozenset({"screens"})
-    one_band: ClassVar[bool] = True
+    requires = frozenset({"boresight"})
+    optional = frozenset({"atmosphere"})
+    provides = frozenset({"screens"})
+    one_band = True
 
     observation: int = Field(0, ge=0)
     """Number of the scan, counted from 0."""

@@ -9,7 +9,7 @@ formed in the order of the detectors.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import model_validator
@@ -43,10 +43,10 @@ class Crosstalk(Operator):
     table in `file`. A sample that is not finite adds nothing to others.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    linear: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "detectors"
+    requires = frozenset({"signal"})
+    provides = frozenset({"signal"})
+    linear = True
+    couples = "detectors"
 
     level: Fraction = quantity("0.3 %", ge=-0.5, le=0.5)
     """Share of each nearest neighbour's signal."""

@@ -18,7 +18,6 @@ exactly; between nodes the error is below (2 pi / `NODES`)^4 / 384 of the fastes
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -49,9 +48,9 @@ class GainDrift(Operator):
     there.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    linear: ClassVar[bool] = True
+    requires = frozenset({"signal"})
+    provides = frozenset({"signal"})
+    linear = True
 
     rms: Fraction = quantity("0.1 %", ge=0, le=0.3)
     """Rms deviation of the gain from 1."""

@@ -12,7 +12,6 @@ over.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -44,8 +43,8 @@ class Glitches(Operator):
     samples.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({Component("glitches", "at the detector")})
+    requires = frozenset({"boresight"})
+    provides = frozenset({Component("glitches", "at the detector")})
 
     rate: Hertz = quantity("2 mHz", ge=0, le=1e3)
     """Mean number of pulses per second in each detector."""

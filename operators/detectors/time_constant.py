@@ -23,7 +23,6 @@ depends on the blocks: what it forgets is e^-REACH of a change of x.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 
@@ -53,9 +52,9 @@ class TimeConstant(Operator):
     samples. Samples that are not finite stay as they are; the filter sees a straight line there.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    linear: ClassVar[bool] = True
+    requires = frozenset({"signal"})
+    provides = frozenset({"signal"})
+    linear = True
 
     tau: Seconds = quantity("5 ms", ge=0, le=60)
     """Time constant."""

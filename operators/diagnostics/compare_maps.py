@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -59,9 +59,9 @@ class CompareMaps(Output):
     tables of spectra and profiles (ECSV). `Plots` and `Report` show it.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"map"})
-    provides: ClassVar[frozenset[str]] = frozenset({"comparison"})
-    one_band: ClassVar[bool] = True
+    requires = frozenset({"map"})
+    provides = frozenset({"comparison"})
+    one_band = True
 
     map: str = "map"
     """Which map, by its name among the products, e.g. noiseless/map."""

@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,9 +81,9 @@ class CompareStreams(StreamDiagnostic):
     Raises `PipelineError` where a stream is absent at this step.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"stream_comparison"})
-    knows_means: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
+    provides = frozenset({"stream_comparison"})
+    knows_means = True
+    couples = "time"
 
     stream: AnyStream = "signal"
     """Which stream: `signal`, that of a signal of `runs` (`signal/noiseless`), a component, or
@@ -218,9 +218,9 @@ class StreamComparison(Series):
         n of one scan.
     """
 
-    usual: ClassVar[str] = "stream_comparison"
-    left_out: ClassVar[str] = "scans left out: other detectors or length"
-    means: ClassVar[tuple[str, ...]] = ("values", "power", "coherence")
+    usual = "stream_comparison"
+    left_out = "scans left out: other detectors or length"
+    means = ("values", "power", "coherence")
 
     stream: str
     reference: str

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -205,9 +205,9 @@ class MapSpectrum(Output):
     map at a time.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"map"})
-    provides: ClassVar[frozenset[str]] = frozenset({"map_spectra"})
-    one_band: ClassVar[bool] = True
+    requires = frozenset({"map"})
+    provides = frozenset({"map_spectra"})
+    one_band = True
 
     maps: list[str] = Field([], max_length=7)
     """Names of products, e.g. [map, source_free/map]. Default: the map and what holds noise alone.

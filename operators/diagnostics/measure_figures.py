@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -31,8 +31,8 @@ class MeasureFigures(Output):
     Raises `PipelineError` or `InputError` where a metric cannot be measured on what the run made.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"figures"})
-    one_band: ClassVar[bool] = True
+    provides = frozenset({"figures"})
+    one_band = True
 
     metrics: list[Choice] = Field(min_length=1)
     """What to measure: names, or mappings of a name to its parameters."""

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,9 +176,9 @@ class ModeSpectrum(StreamDiagnostic):
     (ECSV). `Plots` and `Report` show them.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"modes"})
-    knows_means: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+    provides = frozenset({"modes"})
+    knows_means = True
+    couples = "all"
 
     modes: int = Field(4, ge=1, le=KEPT)
     """How many leading modes to keep the streams of."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,9 +125,9 @@ class PowerSpectrum(StreamDiagnostic):
     ``spectrum`` (a `Spectrum`), or one under this step's own name where it has one.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"spectrum"})
-    knows_means: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
+    provides = frozenset({"spectrum"})
+    knows_means = True
+    couples = "time"
 
     streams: list[StreamName] | None = Field(None, min_length=1)
     """Streams to measure; where absent, `signal` and zonda's own components but `transmission`, as

@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -56,8 +56,8 @@ class Report(Output):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    optional: ClassVar[frozenset[str]] = DRAWN | {"pictures", "map_file", "tod_file", "figures"}
-    provides: ClassVar[frozenset[str]] = frozenset({"report"})
+    optional = DRAWN | {"pictures", "map_file", "tod_file", "figures"}
+    provides = frozenset({"report"})
 
     central_diameter: Angle | None = Field(None, gt=0, examples=["1 arcmin"])
     """Diameter of the circle about the map's centre in which the noise is stated; where absent 1

@@ -146,9 +146,9 @@ class Spectrum(Series):
         (n,) per component: what the law that was simulated promises; where one is known.
     """
 
-    usual: ClassVar[str] = "spectrum"
-    left_out: ClassVar[str] = "scans of another length left out of the mean spectrum"
-    means: ClassVar[tuple[str, ...]] = ("psd", "closed_forms", "white_level")
+    usual = "spectrum"
+    left_out = "scans of another length left out of the mean spectrum"
+    means = ("psd", "closed_forms", "white_level")
 
     frequency: Floats
     psd: dict[str, Floats]
@@ -271,7 +271,7 @@ class TimeStream(Series):
         Name of the scan; the step at which they were taken.
     """
 
-    usual: ClassVar[str] = "time_streams"
+    usual = "time_streams"
 
     seconds: Floats
     streams: dict[str, Floats]
@@ -364,7 +364,7 @@ class Modes(Series):
         Name of the first scan; the step at which they were taken.
     """
 
-    usual: ClassVar[str] = "modes"
+    usual = "modes"
 
     values: Floats
     energy: Floats
@@ -444,8 +444,8 @@ class TimeStreams(StreamDiagnostic):
     `opacity` and `path_delay` (`AtmosphereLayers.outputs`).
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"time_streams"})
-    knows_means: ClassVar[bool] = True
+    provides = frozenset({"time_streams"})
+    knows_means = True
 
     streams: list[StreamName] = Field(["signal"], min_length=1)
     """Streams to keep; components that are absent at this step are skipped and counted."""

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -65,9 +65,9 @@ class TransferFunction(Output):
     ``transfer_function``, which is of I.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"map"})
-    provides: ClassVar[frozenset[str]] = frozenset({"transfer_function"})
-    one_band: ClassVar[bool] = True
+    requires = frozenset({"map"})
+    provides = frozenset({"transfer_function"})
+    one_band = True
 
     modes: Literal["sky", "full"] = "sky"
     """Singular modes of the sky alone (`sky`: the paper's noiseless map), or of the complete data,

@@ -29,7 +29,7 @@ from __future__ import annotations
 import copy
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -219,8 +219,8 @@ class CommonModeFilter(LinearFilter):
     takes part.
     """
 
-    knows_means: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
+    knows_means = True
+    couples = "all"
 
     modes: int = Field(1, ge=1, le=100)
     """How many modes to remove."""

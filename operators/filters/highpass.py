@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ class HighpassFilter(LinearFilter):
     and `trim` flags.
     """
 
-    knows_means: ClassVar[bool] = True
+    knows_means = True
 
     frequency: Hertz = quantity("0.08 Hz", gt=0)
     """Cutoff: lower frequencies are removed (`brick_wall`), or attenuated as the fourth power of

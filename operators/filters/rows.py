@@ -87,10 +87,10 @@ class LinearFilter(Operator):
     ``prepare`` returns the `Removal` that acts on every row and the samples in the source mask.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"signal"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    knows_means: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
+    requires = frozenset({"signal"})
+    provides = frozenset({"signal"})
+    knows_means = True
+    linear = True
     couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "time"
 
     def check(self, data: Data) -> list[str]:

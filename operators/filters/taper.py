@@ -7,8 +7,6 @@ is Tukey's window (`scipy.signal.windows.tukey`), a the share of the scan in whi
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
-
 import numpy as np
 
 from zonda.core.configuration.parameters import quantity
@@ -36,8 +34,8 @@ class Taper(LinearFilter):
     and what it takes off is rounded as a part of it. The log says so.
     """
 
-    knows_means: ClassVar[bool] = True
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "sample"
+    knows_means = True
+    couples = "sample"
 
     share: Fraction = quantity("10 %", ge=0, le=1)
     """Share of the scan in which the window is not 1, half of it at either end."""

@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,8 +116,8 @@ class Reader(toast_hdf5.Reader):
     Observatory that is named there. Detectors without a place or a band are flagged.
     """
 
-    kind: ClassVar[str] = "an AxisManager of sotodlib"
-    cure: ClassVar[str] = "write it again with sotodlib: aman.save(path)"
+    kind = "an AxisManager of sotodlib"
+    cure = "write it again with sotodlib: aman.save(path)"
 
     def _opened(self) -> tuple[TimeOrderedData, Any]:
         group = _root(self._file)

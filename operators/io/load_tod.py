@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class LoadTOD(RecordedFiles):
     'zonda[flac]'``).
     """
 
-    knows_means: ClassVar[bool] = True
+    knows_means = True
 
     @property
     def provides(self) -> frozenset[str]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,7 @@ POSITIVE = ("fwhm", "slope")
 class RecordedInstrument(Instrument):
     """A camera whose detectors are those of files."""
 
-    polarized_by: ClassVar[str] = (
+    polarized_by = (
         "state angles and efficiencies in the focal plane of the file "
         "(HDF5: gamma, pol_leakage; FITS: POLARIZATION_ANGLE, POLARIZATION_EFFICIENCY)"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from astropy.io.fits import Header
@@ -54,8 +54,8 @@ class SaveMap(MapOutput):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"map"})
-    provides: ClassVar[frozenset[str]] = frozenset({"map_file"})
+    requires = frozenset({"map"})
+    provides = frozenset({"map_file"})
 
     central_diameter: Angle | None = Field(None, gt=0, examples=["1 arcmin"])
     """Diameter of the circle about the target in which the noise map's rms is taken; where absent 1

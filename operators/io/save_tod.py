@@ -9,7 +9,7 @@ import threading
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -68,7 +68,7 @@ class SaveTOD(StreamOutput):
     Raises `OutputError` when there is no output folder, it cannot be written, or the disk is full.
     """
 
-    knows_means: ClassVar[bool] = True
+    knows_means = True
 
     format: Literal["hdf5", "fits"] = "hdf5"
     """File format: hdf5 (TOAST's layout) or fits (binary tables)."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,9 +51,9 @@ class BinMap(MapParameters):
     (`stokes`).
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"map"})
-    knows_means: ClassVar[bool] = True
-    all_bands: ClassVar[bool] = True
+    provides = frozenset({"map"})
+    knows_means = True
+    all_bands = True
 
     _layout: Mapping[str, Any] = PrivateAttr(default_factory=dict)
     _grid: Grid | None = PrivateAttr(None)

@@ -167,9 +167,9 @@ class PixelCount(ABC):
 class Crosslinking(PixelCount):
     """n and both parts of the sum of equation (1), the latter in units of 2^-30."""
 
-    columns: ClassVar[int] = 3
-    memory: ClassVar[int] = 96
-    of_hits: ClassVar[bool] = False
+    columns = 3
+    memory = 96
+    of_hits = False
 
     @staticmethod
     def of_scan(

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,11 +52,11 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
     weighed down by their spectra, equation (1), and no scale is filtered away.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"map", "noise_model"})
-    couples: ClassVar[Literal["sample", "detectors", "time", "all"]] = "all"
-    linear: ClassVar[bool] = False
-    averages: ClassVar[bool] = False
-    unfiltered: ClassVar[bool] = True
+    provides = frozenset({"map", "noise_model"})
+    couples = "all"
+    linear = False
+    averages = False
+    unfiltered = True
 
     _samples: tuple[int, int] = PrivateAttr((0, 0))
     _at_once: int = PrivateAttr(1)

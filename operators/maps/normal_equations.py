@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class Compressed:
 class CompressedScans(Product):
     """Compressed scans, in their order."""
 
-    in_files: ClassVar[bool] = True
+    in_files = True
 
     def __init__(self, scans: list[Compressed]) -> None:
         self.scans = scans

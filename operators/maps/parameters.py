@@ -218,7 +218,7 @@ INSTANTS = 1000
 class LikelihoodParameters(MapParameters):
     """Noise model, iteration, and what is taken off."""
 
-    largest_pixel: ClassVar[tuple[float, str]] = (
+    largest_pixel = (
         0.5,
         "what varies within a pixel is taken for noise, and spread over the map (0.2 to 2 % of the"
         " sky's rms at half of the beam, 7 % with modes: 0)",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +38,8 @@ class PinkNoise(Operator):
     the corner.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"pink"})
+    requires = frozenset({"boresight"})
+    provides = frozenset({"pink"})
 
     net: KelvinRootSecond | None = Field(None, ge=0)
     """White level that the knee refers to; None: that of `WhiteNoise`, or the instrument's where

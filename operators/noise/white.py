@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import numpy as np
 from numba import uint64
@@ -45,8 +45,8 @@ class WhiteNoise(Operator):
     before later steps are prepared; of several steps with white noise, all of it.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"white"})
+    requires = frozenset({"boresight"})
+    provides = frozenset({"white"})
 
     net: KelvinRootSecond | None = Field(None, ge=0)
     """Noise-equivalent temperature: the rms of one second of integration; None: the instrument's.

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -47,12 +47,10 @@ class Efficiency(Operator):
     components.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
-    knows_means: ClassVar[bool] = True
-    linear: ClassVar[bool] = True
-    optional: ClassVar[frozenset[str]] = frozenset(
-        {"sky", "atmosphere", "transmission", "white", "pink"}
-    )
+    provides = frozenset({"signal"})
+    knows_means = True
+    linear = True
+    optional = frozenset({"sky", "atmosphere", "transmission", "white", "pink"})
 
     main_beam: Fraction | None = Field(None, gt=0, le=1, examples=["0.6"])
     """zeta, the share of an astronomical signal that the main beam delivers; where absent, the

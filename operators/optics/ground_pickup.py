@@ -14,7 +14,6 @@ has the same dependence on elevation. G_d scatters about 1.
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +38,8 @@ class GroundPickup(Operator):
     scans of one seed.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({Component("ground", "at the detector")})
+    requires = frozenset({"boresight"})
+    provides = frozenset({Component("ground", "at the detector")})
 
     rms: Kelvin = quantity("1 mK", ge=0)
     """Rms over azimuths and over realizations of the ground, at an elevation of 45 deg."""

@@ -4,8 +4,6 @@ turn into polarization.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 from pydantic import Field
 
@@ -33,9 +31,9 @@ class Leakage(Operator):
     the components: put it behind those, and behind a half-wave plate, before `Efficiency`.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere"})
-    optional: ClassVar[frozenset[str]] = frozenset({"sky", "atmosphere"})
-    linear: ClassVar[bool] = True
+    provides = frozenset({"sky", "atmosphere"})
+    optional = frozenset({"sky", "atmosphere"})
+    linear = True
 
     share: Fraction = quantity("1 %", ge=0, le=0.5)
     """l, the share of the intensity that becomes polarized."""
@@ -79,7 +77,7 @@ class HalfWavePlate(Operator):
     `SaveTOD` writes chi as TOAST's ``hwp_angle``.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    requires = frozenset({"boresight"})
 
     frequency: Hertz = Field(ge=-1e4, le=1e4, examples=["2 Hz"])
     """Turns per second; negative: the other way. 0 for a plate that is stepped by `angle`."""

@@ -77,7 +77,7 @@ class Scans(Operator):
         check_limits: Literal["error", "warn"]
         interpolation_error: float
 
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides = frozenset({"boresight"})
 
     def every(self) -> Sequence[Any]:
         """Scans of the step, in their order."""

@@ -19,7 +19,7 @@ direction.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
@@ -44,8 +44,8 @@ class Mispointing(Operator):
     pointing is. It stands behind the pointing step.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    requires = frozenset({"boresight"})
+    provides = frozenset({"boresight"})
 
     offset: tuple[Angle, Angle] | None = Field(None, examples=["3 arcsec"])
     """Constant error towards increasing azimuth (on the sky) and elevation; none where absent."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ class PointingRecorded(Operator):
     limits of speed are not checked: it did move like that.
     """
 
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides = frozenset({"boresight"})
 
     file: InputPath
     """HDF5, FITS table, CSV or antenna log of ASTE."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,8 +73,8 @@ class PointSources(Operator):
     flux) are optional, as are their cells.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+    requires = frozenset({"boresight"})
+    provides = frozenset({"sky"})
 
     catalogue: InputPath
     """Table of the sources."""

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,8 +144,8 @@ class SkyMap(ConvolvedSky):
     interpolated.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+    requires = frozenset({"boresight"})
+    provides = frozenset({"sky"})
 
     def check(self, data: Data) -> list[str]:
         """See `SkyInput.check`; adds the lines about the map that reading it gives."""
@@ -242,8 +242,8 @@ class FullSky(Operator):
     that `SkyMap` and its own state.
     """
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"sky"})
+    requires = frozenset({"boresight"})
+    provides = frozenset({"sky"})
 
     def exec(self, block: Block, state: tuple[SkyMap, ScanSampler]) -> None:
         """See `SkyMap`."""

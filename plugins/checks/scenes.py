@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -144,7 +144,7 @@ def scan(
 class Points(Operator):
     """Points as a given scan does."""
 
-    provides: ClassVar[frozenset[str]] = frozenset({"boresight"})
+    provides = frozenset({"boresight"})
     _observation: Any = PrivateAttr(None)
 
     def observe(self, data: Data) -> None:
@@ -155,8 +155,8 @@ class Points(Operator):
 class Gives(Operator):
     """Provides a given signal (n_det, n_samp)."""
 
-    requires: ClassVar[frozenset[str]] = frozenset({"boresight"})
-    provides: ClassVar[frozenset[str]] = frozenset({"signal"})
+    requires = frozenset({"boresight"})
+    provides = frozenset({"signal"})
     _signal: Any = PrivateAttr(None)
 
     def exec(self, block: Block, state: Any) -> None:

@@ -48,7 +48,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,11 +81,9 @@ TRACE = "accuracy-structure"
 class MapRms(OfParts):
     """Rms of the difference from the reference map over the map's noise, equation (1)."""
 
-    says: ClassVar[str] = "rms of the difference map / the map's instrument noise"
-    reads: ClassVar[frozenset[str]] = frozenset({"map"})
-    instead: ClassVar[str | None] = (
-        "measure central_rms, or name map_rms in zonda accuracy --metric"
-    )
+    says = "rms of the difference map / the map's instrument noise"
+    reads = frozenset({"map"})
+    instead = "measure central_rms, or name map_rms in zonda accuracy --metric"
 
     def measure(self, data: Data) -> dict[str, dict[str, Floats]]:
         return {
@@ -121,11 +119,9 @@ class MapRms(OfParts):
 class Peak(OfParts):
     """Relative change of the extreme value of the beam-smoothed map, equation (2)."""
 
-    says: ClassVar[str] = "relative change of the beam-smoothed map's extreme value"
-    reads: ClassVar[frozenset[str]] = frozenset({"map"})
-    instead: ClassVar[str | None] = (
-        "measure peak_ratio or peak_snr, or name peak in zonda accuracy --metric"
-    )
+    says = "relative change of the beam-smoothed map's extreme value"
+    reads = frozenset({"map"})
+    instead = "measure peak_ratio or peak_snr, or name peak in zonda accuracy --metric"
 
     def measure(self, data: Data) -> dict[str, Floats]:
         main, sky = _map(data), _map(data, _sky_alone(data.provenance.get("runs", {})))
@@ -158,14 +154,12 @@ class Peak(OfParts):
 class Transfer(OfParts):
     """Rms error of the transfer function over angular scales, equation (3)."""
 
-    says: ClassVar[str] = (
+    says = (
         "rms error of the transfer function over angular scales (absolute; it is 1 where nothing is"
         " lost)"
     )
-    reads: ClassVar[frozenset[str]] = frozenset({"map", "sky"})
-    instead: ClassVar[str | None] = (
-        "measure transfer_at, or name transfer in zonda accuracy --metric"
-    )
+    reads = frozenset({"map", "sky"})
+    instead = "measure transfer_at, or name transfer in zonda accuracy --metric"
 
     def signals(self, runs: Mapping[str, Signal]) -> Mapping[str, Signal]:
         """The sky alone, where the pipeline has no such signal."""
@@ -231,13 +225,9 @@ class _Binned(Metric):
 class Psd(_Binned):
     """Rms relative error of the signal's power spectrum, equation (4)."""
 
-    says: ClassVar[str] = (
-        "rms over log-frequency bins of the relative error of the signal's power spectrum"
-    )
-    reads: ClassVar[frozenset[str]] = frozenset({"spectrum"})
-    instead: ClassVar[str | None] = (
-        "measure psd_slope or crossing, or name psd in zonda accuracy --metric"
-    )
+    says = "rms over log-frequency bins of the relative error of the signal's power spectrum"
+    reads = frozenset({"spectrum"})
+    instead = "measure psd_slope or crossing, or name psd in zonda accuracy --metric"
 
     def measure(self, data: Data) -> Floats:
         """(2, n): P_j, and its relative standard error."""
@@ -258,11 +248,9 @@ class Structure(_Binned):
     step of its own.
     """
 
-    says: ClassVar[str] = (
-        "rms relative error of the atmosphere's structure functions in time and across the field"
-    )
-    reads: ClassVar[frozenset[str]] = frozenset({"atmosphere", "signal"})
-    instead: ClassVar[str | None] = "name structure in zonda accuracy --metric"
+    says = "rms relative error of the atmosphere's structure functions in time and across the field"
+    reads = frozenset({"atmosphere", "signal"})
+    instead = "name structure in zonda accuracy --metric"
 
     def steps(self, operators: list[Operator]) -> list[Operator]:
         """The steps with a `TimeStreams` of the atmosphere, and of the noise, behind the one that

@@ -47,7 +47,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -90,7 +90,7 @@ class Fidelity(FigureMetric):
     |1 - g|, below the limit that the threshold sets.
     """
 
-    reads: ClassVar[frozenset[str]] = frozenset({"comparison"})
+    reads = frozenset({"comparison"})
 
     comparison: str = Field("comparison", pattern=r"^[A-Za-z0-9_.]+$")
     """Which one, by its name among the products: that of a `CompareMaps` with a name of its own."""
@@ -128,7 +128,7 @@ class MapPower(FigureMetric):
     add on large ones.
     """
 
-    reads: ClassVar[frozenset[str]] = frozenset({"map_spectra"})
+    reads = frozenset({"map_spectra"})
 
     spectra: str = Field("map_spectra", pattern=r"^[A-Za-z0-9_.]+$")
     """Which ones, by their name among the products: that of a `MapSpectrum` with a name of its own.

@@ -34,7 +34,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -61,7 +61,7 @@ class AndersonDarling(FigureMetric):
     distribution.
     """
 
-    reads: ClassVar[frozenset[str]] = frozenset({"time_streams"})
+    reads = frozenset({"time_streams"})
 
     stream: str = "signal"
     """Which stream."""
@@ -112,7 +112,7 @@ def p_value(stream: Floats, rate: float, above: float | None, every: int) -> flo
 class _OfSpectrum(FigureMetric):
     """A figure of a power spectrum."""
 
-    reads: ClassVar[frozenset[str]] = frozenset({"spectrum"})
+    reads = frozenset({"spectrum"})
 
     spectrum: str = Field("spectrum", pattern=r"^[A-Za-z0-9_.]+$")
     """Which one, by its name among the products: that of a `PowerSpectrum` with a name of its own.
@@ -213,7 +213,7 @@ class FirstComponent(FigureMetric):
     It is measured by a `ModeSpectrum`; with delays there, it is the time-lagged one.
     """
 
-    reads: ClassVar[frozenset[str]] = frozenset({"modes"})
+    reads = frozenset({"modes"})
 
     modes: str = Field("modes", pattern=r"^[A-Za-z0-9_.]+$")
     """Which product: that of a `ModeSpectrum` with a name of its own."""
@@ -247,7 +247,7 @@ class MeanTScan(FigureMetric):
         """Unit of a brightness."""
         return "K_RJ"
 
-    reads: ClassVar[frozenset[str]] = frozenset({"atmosphere", "signal"})
+    reads = frozenset({"atmosphere", "signal"})
 
     of: Literal["scan", "atmosphere"] = "scan"
     """T_scan: the atmosphere's share of the calibrated stream; or T_atm: its brightness, before any
