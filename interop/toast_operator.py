@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 from pydantic import Field, JsonValue, model_validator
 
-from zonda.core.block import Block
 from zonda.core.configuration.diagnostics import nearest, refusal
-from zonda.core.data import Data
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError, PipelineError
 from zonda.core.flags import DETECTOR_MASK, PROCESSING
 from zonda.core.machine import needed
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plan.planning import Planning
 from zonda.core.signal import MAIN

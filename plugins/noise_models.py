@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction, Kelvin
+from zonda.core.data import Observation
 from zonda.core.errors import InputError
+from zonda.core.focalplane import Focalplane
+from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import BOLTZMANN, PLANCK, T_CMB, rayleigh_jeans
 from zonda.core.types import Floats
 from zonda.operators.noise.models import NoiseModel
-
-if TYPE_CHECKING:
-    from zonda.core.data import Observation
-    from zonda.core.focalplane import Focalplane
-    from zonda.core.instrument import Band
 
 CELLS = 32
 """Parts of each interval of a passband's table over which a flat load is integrated: h nu t(nu)

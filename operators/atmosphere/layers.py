@@ -34,17 +34,18 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import PrivateAttr
 
-from zonda.core.block import Block
-from zonda.core.data import Data
+from zonda.core.data import Block, Data
 from zonda.core.errors import PointingError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.observation import ClosedForm, Observation
+from zonda.core.operator import Operator
 from zonda.core.plausibility import PWV, doubt
+from zonda.core.scene import Scene
 from zonda.core.types import Floats
 
 from .fluctuations import AtNodes, OfDetectors
@@ -54,11 +55,6 @@ from .resolution import layer_speeds
 from .turbulence.covariance import NU, mixture
 from .turbulence.nodes import Layer
 from .weather.radiative_transfer import ELEVATION_MIN
-
-if TYPE_CHECKING:
-    from zonda.core.operator import Operator
-    from zonda.core.scene import Scene
-
 
 SLOWEST = 1e-4
 """Lowest speed of a layer whose spectrum is computed, m/s."""

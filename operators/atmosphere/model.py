@@ -8,13 +8,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from zonda.core.configuration.diagnostics import refusal
 from zonda.core.configuration.parameters import Parameters, quantity
+from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Angle, Fraction, Metres, MetresPerSecond
 from zonda.core.data import Data
 from zonda.core.errors import InputError, ZondaError
@@ -40,10 +41,6 @@ from .weather.bands import BandAtmosphere
 from .weather.profiles import Profile
 from .weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
 from .weather.sources import on_the_ground, profile_of
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
-
 
 EDGE_TAPER = 10.0
 """dB: power at the rim of a tapered aperture below that at its centre, where none is given."""

@@ -14,15 +14,13 @@ from typing import Any
 import numpy as np
 from pydantic import model_validator
 
-from zonda.core.block import Block
 from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
-from zonda.core.data import Data
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.focalplane import Focalplane
 from zonda.core.kernels import kernel
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.storage.table_files import read_table
 

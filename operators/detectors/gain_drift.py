@@ -22,13 +22,12 @@ import math
 import numpy as np
 from pydantic import Field
 
-from zonda.core.block import Block
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction, Hertz
+from zonda.core.data import Block, Observation
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import DetectorField
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 

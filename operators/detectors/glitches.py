@@ -16,13 +16,11 @@ import math
 import numpy as np
 from pydantic import Field
 
-from zonda.core.block import Block
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Hertz, Kelvin, Seconds
-from zonda.core.data import Data
+from zonda.core.data import Block, Data, Observation
 from zonda.core.kernels import kernel
 from zonda.core.numerics.random import uniforms
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.signal import Component
 from zonda.core.types import Floats

@@ -26,13 +26,12 @@ import math
 
 import numpy as np
 
-from zonda.core.block import Block
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction, Seconds
+from zonda.core.data import Block, Observation
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.numerics.random import normals
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 

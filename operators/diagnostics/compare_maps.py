@@ -14,6 +14,7 @@ from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
+from zonda.core.instrument import Band
 from zonda.core.maps.image import Image
 from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import Noise, is_quiet, maps_of, matched, noise_alone
@@ -38,8 +39,6 @@ from .series import check_map, key_of, plane_key
 from .transfer_function import window_of
 
 if TYPE_CHECKING:
-    from zonda.core.instrument import Band
-
     from .comparison.files import ReadMap
 
 

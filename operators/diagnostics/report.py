@@ -8,18 +8,21 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from zonda.core.band import Band
 from zonda.core.configuration.describe import described, own_doc
+from zonda.core.configuration.target import Target
 from zonda.core.configuration.units import Angle
 from zonda.core.data import Data
 from zonda.core.errors import ZondaError
 from zonda.core.figures import Figures
+from zonda.core.instrument import Instrument
 from zonda.core.maps.beams import expected_fwhm
+from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.noise_figures import NoiseFigure, maps_of, noise_figures
 from zonda.core.maps.planes import central_diameter, in_beams
 from zonda.core.numerics.radiation import to_kelvin_rj
@@ -32,11 +35,6 @@ from zonda.core.tables import render
 from zonda.core.types import AnyFloats
 
 from .plot_operators import DRAWN, Picture, Plots, pictures
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.target import Target
-    from zonda.core.instrument import Instrument
-    from zonda.core.maps.map_product import MapProduct
 
 LONG = 12
 """Rows of a table that are shown; the rest of a longer one is folded away. Half as many of files,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import singledispatch
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from zonda.core.canvas import (
     unit_of,
     wide_legend,
 )
+from zonda.core.data import Observation
 from zonda.core.numerics.sphere import ARCSEC
 from zonda.core.plots import draw_stream, draw_tracks
 from zonda.core.stream import unit_of_stream
@@ -29,9 +30,6 @@ from zonda.core.types import AnyFloats
 
 from .series import Modes, Spectrum, TimeStream
 from .transfer_function import Transfer
-
-if TYPE_CHECKING:
-    from zonda.core.data import Observation
 
 LARGEST_RATIO = 2.0
 """S of a ring of a transfer function above which its power was brought from other scales: a filter

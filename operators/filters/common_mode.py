@@ -35,13 +35,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from zonda.core.data import Block, Observation
+from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.signal import MAIN
-from zonda.core.stream import Stream
 from zonda.core.types import Floats
 
 from .gram import NOTHING, Gram, Ritz, Usable, lanczos

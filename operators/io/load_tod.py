@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zonda.core import flags
 from zonda.core.configuration.time import Instant
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError
+from zonda.core.instrument import Instrument
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.quaternions import conjugate, directions, middle, multiply
-from zonda.core.observation import Observation
 from zonda.core.signal import Component
+from zonda.core.site import Site
 from zonda.core.types import Floats
 
 from .recorded_files import File, RecordedBand, RecordedFiles, Scan
 from .recorded_scan import joined
 from .recorded_stream import RecordedStream
 from .time_ordered_data import TimeOrderedData
-
-if TYPE_CHECKING:
-    from zonda.core.block import Block
-    from zonda.core.data import Data
-    from zonda.core.instrument import Instrument
-    from zonda.core.site import Site
 
 RECORDED = Component("recorded", "calibrated")
 """The stream of a file: it enters the signal as it is, calibrated."""

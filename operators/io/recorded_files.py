@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,11 @@ from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Fraction, RadioFrequency
 from zonda.core.errors import InputError
 from zonda.core.flags import Intervals, intervals_of
+from zonda.core.instrument import Instrument
+from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
+from zonda.core.weather import GroundWeather
 
 from .recorded_scan import (
     RecordedInstrument,
@@ -36,11 +39,6 @@ from .recorded_stream import RecordedStream, check_unit, kelvin_per
 from .save_tod import reader
 from .time_ordered_data import TimeOrderedData
 from .toast_noise import DEFAULT_MODEL
-
-if TYPE_CHECKING:
-    from zonda.core.instrument import Instrument
-    from zonda.core.observation import Observation
-    from zonda.core.weather import GroundWeather
 
 NEW_SCANS = 8
 """Files whose pointing is kept after it was read."""

@@ -9,7 +9,7 @@ import threading
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,13 +21,11 @@ from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
 from zonda.core.storage.files import atomic_path, check_memory, product_path
 from zonda.core.stream import UNITS, StreamName, streams_asked, streams_needed
+from zonda.core.weather import GroundWeather
 
 from . import axismanager, fits_table, toast_hdf5
 from .recorded_stream import kelvin_per
 from .time_ordered_data import TimeOrderedData, TodWriter
-
-if TYPE_CHECKING:
-    from zonda.core.weather import GroundWeather
 
 _FORMATS: dict[str, Any] = {"hdf5": toast_hdf5, "fits": fits_table}
 

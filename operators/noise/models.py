@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,17 +20,14 @@ from zonda.core.configuration.diagnostics import refusal
 from zonda.core.configuration.parameters import Parameters
 from zonda.core.configuration.units import KelvinRootSecond
 from zonda.core.errors import PipelineError, ZondaError
+from zonda.core.focalplane import Focalplane
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.smooth import SmoothField
+from zonda.core.observation import Observation, WhiteLevel
 from zonda.core.registry import noise_models
 from zonda.core.types import Floats
-
-if TYPE_CHECKING:
-    from zonda.core.focalplane import Focalplane
-    from zonda.core.observation import Observation, WhiteLevel
-
 
 INSTANTS = 64
 """Times of a scan at which its transmission is looked at, at most."""

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from zonda.core.configuration.units import Fraction, Hertz, KelvinRootSecond
+from zonda.core.data import Block, Data
 from zonda.core.errors import placed
-from zonda.core.observation import ClosedForm
+from zonda.core.observation import ClosedForm, Observation, WhiteLevel
 from zonda.core.operator import Operator
 from zonda.core.plausibility import KNEE, doubt
 from zonda.core.types import Floats
@@ -20,11 +21,6 @@ from zonda.core.types import Floats
 from .models import Amplitude, FixedNet, NoiseLevel, announced, resolve
 from .one_over_f import PowerLawFilter, power_law_filter
 from .streams import Streams, StreamsOfSlopes
-
-if TYPE_CHECKING:
-    from zonda.core.block import Block
-    from zonda.core.data import Data
-    from zonda.core.observation import Observation, WhiteLevel
 
 
 class PinkNoise(Operator):

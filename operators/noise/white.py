@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numba import uint64
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import placed
+from zonda.core.focalplane import Focalplane
 from zonda.core.kernels import kernel
 from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into
@@ -18,14 +21,6 @@ from zonda.core.operator import Operator
 from zonda.core.plausibility import NET, doubt
 
 from .models import Amplitude, FixedNet, NoiseLevel, NoiseModel, noise_model, resolve
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from zonda.core.block import Block
-    from zonda.core.data import Data
-    from zonda.core.focalplane import Focalplane
-    from zonda.core.observation import Observation
 
 _SCHEMA = {
     "anyOf": [

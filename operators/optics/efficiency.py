@@ -23,16 +23,15 @@ import numpy as np
 from pydantic import Field
 
 from zonda.core import flags
-from zonda.core.block import Block
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
+from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals
 from zonda.core.numerics.smooth import FieldSums, Series, SmoothField, series_into
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.types import AnyFloats, Floats
 

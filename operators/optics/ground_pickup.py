@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from zonda.core.block import Block
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Fraction, Kelvin
+from zonda.core.data import Block, Observation
 from zonda.core.numerics.random import normals, stream_key
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.signal import Component
 from zonda.core.types import Floats

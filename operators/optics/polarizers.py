@@ -7,11 +7,9 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from zonda.core.block import Block
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Fraction, Hertz
-from zonda.core.data import Data
-from zonda.core.observation import Observation
+from zonda.core.data import Block, Data, Observation
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
+from zonda.core.data import Observation
 from zonda.core.errors import PointingError
 from zonda.core.flags import Intervals
 from zonda.core.numerics.chunks import chunks
@@ -19,9 +20,6 @@ from zonda.core.types import Floats
 from .base import Aim, Pointing
 from .observed import mark_sun, mark_turnarounds
 from .sweep import Sweep
-
-if TYPE_CHECKING:
-    from zonda.core.data import Observation
 
 
 class PointingBackAndForth(Pointing):

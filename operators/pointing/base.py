@@ -15,26 +15,24 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
+from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Angle, Fraction, SampleRate, Seconds
+from zonda.core.data import Data, Observation
 from zonda.core.errors import PointingError
 from zonda.core.flags import Intervals
+from zonda.core.instrument import Instrument
 from zonda.core.numerics.celestial import Boresight, CelestialTransform
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
+from zonda.core.scene import Scene
 from zonda.core.types import Floats
 
 from .limits import LargestMotion, check_elevation, excess, what_fits, when_up
 from .motion import POINTS, LargestDerivative, Quantity, SamplesPerBeam, motion
 from .observed import centre_of, distances, observed, plot_step, report, state_times, transform_of
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
-    from zonda.core.data import Data, Observation
-    from zonda.core.instrument import Instrument
-    from zonda.core.scene import Scene
 
 SCANS_LOOKED_AT, INSTANTS_LOOKED_AT = 12, 1 << 14
 """By `Pointing.check`: scans of a step, and instants of all of them."""

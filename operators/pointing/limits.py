@@ -10,22 +10,20 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from zonda.core.configuration.parameters import Parameters
+from zonda.core.configuration.target import Target
 from zonda.core.errors import PointingError
+from zonda.core.instrument import Telescope
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.sphere import angles, unit_vectors
 from zonda.core.plan.bounds import evenly
 from zonda.core.types import Floats
 
 from .motion import QUANTITIES, LargestDerivative, Quantity, rate_text
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.target import Target
-    from zonda.core.instrument import Telescope
 
 Scan = TypeVar("Scan", bound=Parameters)
 

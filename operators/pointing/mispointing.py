@@ -19,20 +19,17 @@ direction.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Seconds
+from zonda.core.data import Data, Observation
 from zonda.core.numerics.quaternions import multiply
 from zonda.core.numerics.random import normals
 from zonda.core.operator import Operator
 from zonda.core.types import Floats
-
-if TYPE_CHECKING:
-    from zonda.core.data import Data, Observation
 
 
 class Mispointing(Operator):

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.configuration.target import Target
+from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
 from zonda.core.flags import SUN_CLOSE, SUN_UP, TURNAROUND, Intervals, intervals_of
 from zonda.core.numerics.bodies import Track, tracks
@@ -21,16 +23,13 @@ from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import directions
 from zonda.core.numerics.sphere import unit_vectors
+from zonda.core.operator import Operator
 from zonda.core.plots import plot_scans
+from zonda.core.scene import Scene
+from zonda.core.site import Site
 from zonda.core.types import Floats
 
 if TYPE_CHECKING:
-    from zonda.core.configuration.target import Target
-    from zonda.core.configuration.time import Instant
-    from zonda.core.operator import Operator
-    from zonda.core.scene import Scene
-    from zonda.core.site import Site
-
     from .limits import LargestMotion
     from .motion import SamplesPerBeam
 

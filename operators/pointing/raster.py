@@ -23,14 +23,16 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, AngularAcceleration, AngularSpeed
+from zonda.core.data import Data, Observation
 from zonda.core.flags import Intervals, intervals_of
+from zonda.core.instrument import Instrument
 from zonda.core.numerics.celestial import Boresight
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
@@ -41,10 +43,6 @@ from .base import Aim, Pointing, kind
 from .motion import rate_text
 from .observed import mark_turnarounds
 from .sweep import Sweep
-
-if TYPE_CHECKING:
-    from zonda.core.data import Data, Observation
-    from zonda.core.instrument import Instrument
 
 WIDEST = math.radians(5.0)
 """Largest side of a raster that follows from the field of view."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,15 @@ from zonda.core import flags
 from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.target import Target
+from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Fraction, Seconds
+from zonda.core.data import Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.flags import cut_intervals
 from zonda.core.numerics.quaternions import directions, middle
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
+from zonda.core.scene import Scene
 from zonda.core.types import Floats
 
 from .limits import check_elevation
@@ -27,13 +31,6 @@ from .motion import SamplesPerBeam
 from .observed import centre_of, observed, plot_step, report, state_times, transform_of
 from .recording import OUT_OF_ORDER, Comb, Recording, Scan, comb
 from .recording_files import Clock, read_recording
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from zonda.core.configuration.time import Instant
-    from zonda.core.data import Data, Observation
-    from zonda.core.scene import Scene
 
 MOST_CHECKED = 100_000
 """Samples of a scan that `zonda check` looks at."""

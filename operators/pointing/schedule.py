@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -24,11 +24,13 @@ from zonda.core.configuration.units import (
     SampleRate,
     Unit,
 )
+from zonda.core.data import Data, Observation
 from zonda.core.errors import InputError, PointingError
 from zonda.core.flags import IRREGULAR, intervals_of
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.quaternions import multiply
 from zonda.core.numerics.sphere import angles, separation, unit_vectors
+from zonda.core.scene import Scene
 from zonda.core.storage.table_files import Table, read_table, read_text
 from zonda.core.types import Floats
 
@@ -37,11 +39,6 @@ from .limits import LargestMotion, check_elevation
 from .motion import POINTS, LargestDerivative, Quantity, motion
 from .observed import mark_turnarounds, observed, sunlit, transform_of
 from .sweep import Nod, Sweep
-
-if TYPE_CHECKING:
-    from zonda.core.data import Data, Observation
-    from zonda.core.scene import Scene
-
 
 COLUMNS = (
     "start_time",

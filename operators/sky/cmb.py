@@ -26,11 +26,10 @@ import numpy as np
 from pydantic import Field, PrivateAttr
 
 from zonda.core.configuration.input_paths import InputPath
-from zonda.core.data import Data
+from zonda.core.data import Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import T_CMB
 from zonda.core.numerics.random import normals, stream_key
-from zonda.core.observation import Observation
 from zonda.core.storage.table_files import NUMBERED, read_table
 from zonda.core.types import Floats
 

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.configuration.target import Target
-from zonda.core.data import Block
+from zonda.core.data import Block, Data, Log, Observation
+from zonda.core.instrument import Band
 from zonda.core.maps.header import exact_header
 from zonda.core.maps.image import Image
 from zonda.core.numerics.radiation import to_kelvin_rj
@@ -27,11 +28,6 @@ from .map_header import DOUBT, check_brightness, odd_pixels
 from .region import directions_on
 from .sampling import Chunks, Rows, pointing, sample
 from .sky_input import GAS, SkyInput
-
-if TYPE_CHECKING:
-    from zonda.core.data import Data, Log, Observation
-    from zonda.core.instrument import Band
-
 
 BRIGHT = 1e4
 """K_RJ, averaged over a beam, above which a map's unit is doubted: the Sun has 6000 K."""

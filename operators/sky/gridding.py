@@ -37,11 +37,12 @@ import math
 from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.data import Observation
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_matrices
@@ -59,10 +60,6 @@ from .region import (
     region,
     tangent_grid_wcs,
 )
-
-if TYPE_CHECKING:
-    from zonda.core.data import Observation
-
 
 LEAST, MOST = 0.2, 0.5
 """Limits of f, the share of the beam's variance that the narrower Gaussians have."""

@@ -7,11 +7,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import ImagePixels, wcs_grid
 from zonda.core.maps.map_reading import Frame
@@ -23,10 +24,6 @@ from zonda.core.types import Floats
 
 from .region import MARGIN, Block, Disc
 from .sampling import NEIGHBOURS, local_fit
-
-if TYPE_CHECKING:
-    from zonda.core.data import Observation
-
 
 CUTS = 8
 """Pieces along each side into which a pixel at the edge of a projection is cut."""

@@ -21,18 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from zonda.core.block import Block
 from zonda.core.configuration.input_paths import InputPath
 from zonda.core.configuration.target import GALACTIC_TO_ICRS
 from zonda.core.configuration.units import RadioFrequency
-from zonda.core.data import Data
+from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.kernels import kernel
 from zonda.core.numerics.projection import boresights, rotation_matrices
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.sphere import unit_vectors
-from zonda.core.observation import Observation
 from zonda.core.operator import Operator
 from zonda.core.plausibility import FLUX, doubt
 from zonda.core.storage.table_files import SERIALIZED, read_table

@@ -30,11 +30,10 @@ from pydantic import AfterValidator, Field, PrivateAttr, ValidationInfo, model_v
 
 from zonda.core.configuration.diagnostics import nearest
 from zonda.core.configuration.input_paths import find
-from zonda.core.data import Data
+from zonda.core.data import Data, Observation
 from zonda.core.errors import InputError
 from zonda.core.instrument import Band
 from zonda.core.machine import needed
-from zonda.core.observation import Observation
 from zonda.core.types import Floats
 
 from .skymap import FullSky, Nside, ScanSampler, SkyMap

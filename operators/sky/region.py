@@ -7,19 +7,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, pixel_matrix, tangent_wcs
 from zonda.core.numerics.sphere import local_axes
 from zonda.core.types import Floats
-
-if TYPE_CHECKING:
-    from zonda.core.data import Observation
 
 WIDEST = np.radians(60.0)
 """Largest distance from the tangent point: beyond it a gnomonic projection stretches pixels by more

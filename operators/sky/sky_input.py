@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar, cast
+from typing import Annotated, Any, Literal, Self, TypeVar, cast
 
 import numpy as np
 from pydantic import Discriminator, Field, PrivateAttr, Tag, model_validator
@@ -23,6 +23,7 @@ from zonda.core.configuration.units import Angle, Kelvin, ThermalEnergy, Unit
 from zonda.core.data import Data, percent
 from zonda.core.errors import InputError
 from zonda.core.hooks import manager
+from zonda.core.instrument import Band
 from zonda.core.maps.map_reading import STOKES
 from zonda.core.numerics.projection import share_outside
 from zonda.core.numerics.radiation import HOTTEST_GAS, sz_of_band, sz_per_y
@@ -36,9 +37,6 @@ from .input_map import ImageMap, InputMap
 from .map_header import DOUBT, seen_twice
 from .read import ArrayMap, WorldCoordinates, checked_unit, read_map
 from .region import Progress, no_progress
-
-if TYPE_CHECKING:
-    from zonda.core.instrument import Band
 
 T = TypeVar("T")
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zonda.core.accuracy.metrics import Metric
+from zonda.core.configuration.loaded import PipelineFile
 from zonda.core.data import Data
 from zonda.core.errors import InputError
 from zonda.core.experiment.experiment import Experiment
@@ -26,7 +27,6 @@ from .depth import PARTS, Depth, prefixed, scatter
 from .survey import steps_of
 
 if TYPE_CHECKING:
-    from zonda.core.configuration.loaded import PipelineFile
     from zonda.operators.sky.skymap import SkyMap
 
     from .source import Seen

@@ -15,15 +15,17 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from zonda.core import registry
 from zonda.core.configuration.diagnostics import input_error
+from zonda.core.configuration.loaded import PipelineFile
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Unit
@@ -31,13 +33,8 @@ from zonda.core.errors import InputError, PointingError
 from zonda.core.instrument import Instrument, Telescope
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.site import Site
+from zonda.core.types import Floats
 from zonda.core.weather import Pwv
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from zonda.core.configuration.loaded import PipelineFile
-    from zonda.core.types import Floats
 
 ELEVATION = math.radians(60)
 LONGEST, MOST = 600.0, 6

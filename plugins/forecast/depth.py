@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from zonda.core.errors import InputError
+from zonda.core.instrument import Band
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.types import Floats
 
 from . import atmosphere_noise, detector_noise, stokes_noise
 
 if TYPE_CHECKING:
-    from zonda.core.instrument import Band
-
     from .survey import Survey
 
 

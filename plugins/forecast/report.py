@@ -11,11 +11,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from zonda.core.canvas import COLOURS, DPI
+from zonda.core.configuration.loaded import PipelineFile
 from zonda.core.errors import InputError
 from zonda.core.numerics.sphere import ARCMIN, ARCSEC
 from zonda.core.storage.files import atomic_path, check_output_folder, write_text
@@ -40,9 +41,6 @@ from .depth import (
 )
 from .source import FORMS, OF, Placed, Seen, Source, sigmas
 from .survey import Survey, elevations
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.loaded import PipelineFile
 
 USUAL = ("point", "gaussian 1 arcmin")
 """Sources whose loss is told where none is asked for."""

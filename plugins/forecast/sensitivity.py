@@ -6,8 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from zonda.core.configuration.loaded import PipelineFile
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
 from zonda.core.numerics.sphere import ARCMIN
@@ -18,10 +19,6 @@ from .depth import depths_of, factors
 from .report import Sensitivity, SensitivityOfBands
 from .source import FORMS, Placed, Source
 from .survey import survey_of
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.loaded import PipelineFile
-
 
 RADIUS, BEAMS = 0.5 * ARCMIN, 2.0
 """Radius of the circle that the depth is averaged over where none is given: the central arcmin, or

@@ -24,9 +24,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,9 +53,6 @@ from .default_pipeline import parsed
 from .depth import Depth, in_unit, read_depth
 from .detector_noise import Comb
 from .survey import Survey, Track, sparse, subset
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 FORMS = "'point', 'gaussian 1 arcmin', 'beta 1 arcmin 0.7', 'disc 30 arcsec', or a FITS map"
 PEAKS = "'1 mJy/beam', '0.1 MJy/sr', '200 uK', or '300 uK_CMB'"

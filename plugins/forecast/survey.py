@@ -11,12 +11,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.assembly.signals import note_signals
+from zonda.core.configuration.loaded import PipelineFile
 from zonda.core.errors import PipelineError
 from zonda.core.focalplane import Focalplane
 from zonda.core.mapmaker import makes_products
@@ -30,6 +31,7 @@ from zonda.core.pipeline import Pipeline
 from zonda.core.plan.bounds import evenly
 from zonda.core.plan.pointing import observed, speeds
 from zonda.core.polarization import PolarizationAngles
+from zonda.core.scene import Scene
 from zonda.core.types import AnyFloats, Floats
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.brick_wall import plan_highpass
@@ -44,11 +46,6 @@ from zonda.operators.noise.white import WhiteNoise
 from zonda.operators.optics.efficiency import Efficiency
 from zonda.operators.optics.polarizers import HalfWavePlate
 from zonda.operators.sky.skymap import SkyMap
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.loaded import PipelineFile
-    from zonda.core.scene import Scene
-
 
 COVERED: dict[type[Operator], frozenset[str] | None] = {
     AtmosphereLayers: frozenset(AtmosphereLayers.model_fields) - {"beam", "edge_taper"},

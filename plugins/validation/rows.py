@@ -21,6 +21,7 @@ from zonda.core.experiment.experiment import Experiment as Tasks
 from zonda.core.experiment.variant import FileVariant
 from zonda.core.figures import Choice
 from zonda.core.registry import operators
+from zonda.core.scene import Scene
 from zonda.core.storage.files import atomic_path, check_output_folder, write_text
 from zonda.operators.atmosphere.weather.sources import profile_of
 from zonda.plugins.commands.weather_plots import plot_spectrum
@@ -30,8 +31,6 @@ from .claims import FOLDER, Claim, Comparison, Experiment, Verdict, compare, con
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from zonda.core.scene import Scene
 
 
 def atmosphere_figure(scene: Scene) -> Figure:

@@ -22,6 +22,7 @@ from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import ArrayLike
 
 from zonda.core.errors import InputError
+from zonda.core.instrument import Band
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import rayleigh_jeans
 from zonda.core.observation import LoadSpectra
@@ -32,8 +33,6 @@ from .profiles import PWV_MAX, check_pwv
 from .radiative_transfer import ELEVATION_MIN, Layers, check_elevations, emission, emission_slopes
 
 if TYPE_CHECKING:
-    from zonda.core.instrument import Band
-
     from .profiles import Profile
 
 

@@ -16,13 +16,13 @@ from calendar import isleap
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
+from zonda.core.site import Site
 from zonda.core.storage.files import own_data
 from zonda.core.types import Floats
 from zonda.core.weather import Column
@@ -30,9 +30,6 @@ from zonda.core.weather import Column
 from .air import standard_column
 from .profiles import Profile, check_pwv, on_heights
 from .radiative_transfer import VAPOUR_GAS_CONSTANT
-
-if TYPE_CHECKING:
-    from zonda.core.site import Site
 
 CLIMATOLOGY = Path(__file__).parent.parent / "data" / "climatology.npz"
 

@@ -16,23 +16,20 @@ from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zonda.core.configuration.input_paths import InputPath
+from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError, placed
+from zonda.core.site import Site
 from zonda.core.types import Floats
 from zonda.core.weather import Column, WeatherSource
 
 from .air import from_relative, from_specific, impossible, ozone_from_mass
 from .netcdf import GET, QUANTITIES, NetCdf, opened
 from .radiative_transfer import GRAVITY
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
-    from zonda.core.site import Site
-
 
 SPACING_MAX = 1.0
 """deg between grid points, beyond which a mountain and its valley are one."""

@@ -8,12 +8,13 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from zonda.core.errors import InputError
+from zonda.core.site import Site
 from zonda.core.types import Floats
 from zonda.core.weather import PWV_MAX as PWV_MAX
 from zonda.core.weather import Column
@@ -26,10 +27,6 @@ from .air import (
     upper_levels,
 )
 from .radiative_transfer import GRAVITY, VAPOUR_GAS_CONSTANT, Layers
-
-if TYPE_CHECKING:
-    from zonda.core.site import Site
-
 
 LEVELS = 61
 """Heights of a profile."""

@@ -5,13 +5,16 @@ its source, site, time, PWV and seed.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from zonda.core.configuration.input_paths import InputPath
+from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.numerics.random import normals, stream_key, uniforms
+from zonda.core.scene import Scene
+from zonda.core.site import Site
 from zonda.core.storage import table_files
 from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import Column, GroundWeather, Pwv, WeatherSource
@@ -29,11 +32,6 @@ from .air import (
 from .climatology import climatology_column
 from .profiles import Profile, check_pwv, on_heights
 from .radiative_transfer import VAPOUR_GAS_CONSTANT
-
-if TYPE_CHECKING:
-    from zonda.core.configuration.time import Instant
-    from zonda.core.scene import Scene
-    from zonda.core.site import Site
 
 HIGHEST = 8e3
 """m above sea level that a table must reach: nearly all water lies below."""
