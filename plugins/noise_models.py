@@ -165,9 +165,7 @@ class BackgroundLimited(NoiseModel):
         # NEP^2 / (eta N k): the shot noise has one of these factors, bunching two, one of them over
         # N.
         squared = shot + waves * bunching * self.optical_efficiency
-        return np.asarray(
-            np.sqrt(squared / (2 * self.optical_efficiency * n_modes * BOLTZMANN)) / sky.width
-        )
+        return np.sqrt(squared / (2 * self.optical_efficiency * n_modes * BOLTZMANN)) / sky.width
 
 
 @dataclass(frozen=True)

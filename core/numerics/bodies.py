@@ -55,12 +55,12 @@ class Track:
 
     @property
     def azimuth(self) -> Floats:
-        return np.asarray(np.arctan2(self.direction[:, 1], self.direction[:, 0]) % (2 * np.pi))
+        return np.arctan2(self.direction[:, 1], self.direction[:, 0]) % (2 * np.pi)
 
     @property
     def elevation(self) -> Floats:
-        return np.asarray(
-            np.arctan2(self.direction[:, 2], np.hypot(self.direction[:, 0], self.direction[:, 1]))
+        return np.arctan2(
+            self.direction[:, 2], np.hypot(self.direction[:, 0], self.direction[:, 1])
         )
 
     def distance(self, other: Track) -> Floats:

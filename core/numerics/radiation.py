@@ -52,7 +52,7 @@ def rayleigh_jeans(frequency: ArrayLike, temperature: ArrayLike) -> Floats:
     nu, temperature = np.asarray(frequency, np.float64), np.asarray(temperature, np.float64)
     x = PLANCK * nu / (BOLTZMANN * temperature)
     with np.errstate(over="ignore"):
-        return np.asarray(temperature * x / np.expm1(x))
+        return temperature * x / np.expm1(x)
 
 
 def cmb_slope(frequency: ArrayLike) -> Floats:
@@ -61,7 +61,7 @@ def cmb_slope(frequency: ArrayLike) -> Floats:
     """
     half = PLANCK * np.asarray(frequency, np.float64) / (2 * BOLTZMANN * T_CMB)
     with np.errstate(over="ignore"):
-        return np.asarray((half / np.sinh(half)) ** 2)
+        return (half / np.sinh(half)) ** 2
 
 
 def thermal_sz(frequency: ArrayLike) -> Floats:
@@ -71,7 +71,7 @@ def thermal_sz(frequency: ArrayLike) -> Floats:
     Sunyaev & Zel'dovich (1972); negative below 217.5 GHz. Of hot gas: `sz_terms`.
     """
     x = PLANCK * np.asarray(frequency, np.float64) / (BOLTZMANN * T_CMB)
-    return np.asarray(T_CMB * (x / np.tanh(x / 2) - 4) * cmb_slope(frequency))
+    return T_CMB * (x / np.tanh(x / 2) - 4) * cmb_slope(frequency)
 
 
 SZ_SERIES = (
@@ -134,7 +134,7 @@ def intensity_to_kelvin(frequency: ArrayLike) -> Floats:
     """Rayleigh-Jeans kelvin per unit of specific intensity, c^2 / (2 k nu^2). Hz -> K / (W m^-2
     Hz^-1 sr^-1).
     """
-    return np.asarray(SPEED_OF_LIGHT**2 / (2 * BOLTZMANN * np.asarray(frequency, np.float64) ** 2))
+    return SPEED_OF_LIGHT**2 / (2 * BOLTZMANN * np.asarray(frequency, np.float64) ** 2)
 
 
 def band_average(band: Band, function: Callable[[Floats], Floats]) -> float:
@@ -195,7 +195,7 @@ def to_kelvin_rj(
         centre = band.centre
 
         def power_law(nu: Floats) -> Floats:
-            return np.asarray((nu / centre) ** spectral_index * intensity_to_kelvin(nu))
+            return (nu / centre) ** spectral_index * intensity_to_kelvin(nu)
 
         return band_average(band, power_law) * _intensity(unit, pixel_solid_angle, beam_solid_angle)
     if spectral_index != 0.0:

@@ -68,7 +68,7 @@ def local_axes(longitude: float, latitude: float) -> Floats:
 
 def angle_between(a: Floats, b: Floats) -> Floats:
     """Between unit vectors (..., 3) and one (3,)."""
-    return np.asarray(np.arccos(np.clip(a @ b, -1, 1)))
+    return np.arccos(np.clip(a @ b, -1, 1))
 
 
 def separation(longitude: Floats, latitude: Floats, centre: tuple[float, float]) -> Floats:

@@ -69,7 +69,7 @@ class Slab:
     def _density(self, height: Floats) -> Floats:
         if self.profile is None:
             return np.ones(height.shape)
-        return np.asarray(self.profile.at(height).vapour_density)
+        return self.profile.at(height).vapour_density
 
 
 def air_correlation(x: Floats) -> Floats:

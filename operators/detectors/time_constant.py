@@ -68,7 +68,7 @@ class TimeConstant(Operator):
             return np.full(observation.n_detectors, self.tau)
         key = observation.camera_key(self.label)
         drawn = normals(key, 0, observation.n_detectors).astype(np.float64)
-        return np.asarray(self.tau * np.exp(math.log1p(self.scatter) * drawn))
+        return self.tau * np.exp(math.log1p(self.scatter) * drawn)
 
     def halo(self, observation: Observation) -> int:
         """Samples that it remembers and that tell the signal between two."""
@@ -116,7 +116,7 @@ def weights(tau: float) -> Floats:
 def _interpolating(x: Floats) -> Floats:
     """sinc times Kaiser's window of half width `TAPS`."""
     window = np.i0(BETA * np.sqrt(np.maximum(1 - (x / TAPS) ** 2, 0))) / np.i0(BETA)
-    return np.asarray(np.where(np.abs(x) < TAPS, np.sinc(x) * window, 0.0))
+    return np.where(np.abs(x) < TAPS, np.sinc(x) * window, 0.0)
 
 
 def _reach(tau: float, rate: float) -> int:

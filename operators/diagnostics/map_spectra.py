@@ -104,7 +104,7 @@ def sphere_spectra(
 
     def mean_of(values: Floats) -> Floats:
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.bincount(ring, weight * values, bins + 1)[:bins] / count)
+            return np.bincount(ring, weight * values, bins + 1)[:bins] / count
 
     names = [name, f"{name}_E", f"{name}_B"][: len(planes)]
     white = _white(names, planes, window, 4 * math.pi / number)

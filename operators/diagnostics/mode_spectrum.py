@@ -113,7 +113,7 @@ class Lagged:
         if mean is not None:
             for row, d in zip(x, self.detectors, strict=True):
                 row += mean.evaluate(slice(int(d), int(d) + 1), samples)[0]
-        return np.asarray(x - self._start)
+        return x - self._start
 
 
 def components(

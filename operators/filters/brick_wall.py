@@ -201,7 +201,7 @@ class HighpassPlan:
     def _low_exact(self, x: AnyFloats) -> AnyFloats:
         """P x of equation (1), directly."""
         fit = (self.polynomials @ x) @ self.polynomials
-        return np.asarray(fit + self._cosines_exact(x - fit))
+        return fit + self._cosines_exact(x - fit)
 
     def _cosines_exact(self, x: AnyFloats) -> AnyFloats:
         """The cosines below the cut of a row (N,)."""
@@ -209,7 +209,7 @@ class HighpassPlan:
 
         spectrum = dct(x, type=2)
         spectrum[self.cut :] = 0
-        return np.asarray(idct(spectrum, type=2))
+        return idct(spectrum, type=2)
 
 
 def first_kept(n: int, frequency: float) -> int:

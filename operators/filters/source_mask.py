@@ -183,7 +183,7 @@ class InsideDisc:
         found = np.zeros((a.shape[1], b.shape[1]))
         for k in range(3):
             found += (a[k, :, None] - b[k]) ** 2
-        return np.asarray(found <= (2 * self.half_chord) ** 2)
+        return found <= (2 * self.half_chord) ** 2
 
 
 def counts(inside: Inside, n_detectors: int, n_samples: int) -> tuple[int, int]:

@@ -240,7 +240,7 @@ class _Bins:
         for apart, common in enumerate(MEDIANS, 1):
             np.add.at(found, (which[apart:], which[:-apart]), common)
             np.add.at(found, (which[:-apart], which[apart:]), common)
-        return np.asarray(found / np.outer(self.number, self.number))
+        return found / np.outer(self.number, self.number)
 
     def mean(self, values: Floats) -> Floats:
         """Mean in each bin."""

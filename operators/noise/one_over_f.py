@@ -202,7 +202,7 @@ def _log_power(root: Any, sine: Floats) -> Any:
 
     The real part of that of a complex r is half of what r and r* make.
     """
-    return np.asarray(np.log(root[:, None] ** 2 + (1 - root[:, None]) * sine))
+    return np.log(root[:, None] ** 2 + (1 - root[:, None]) * sine)
 
 
 def _is_level(law: PowerLawFilter, f_min: float, slope: float) -> bool:
@@ -217,7 +217,7 @@ def _is_level(law: PowerLawFilter, f_min: float, slope: float) -> bool:
 
 def _residues(poles: Complexes, zeros: Complexes) -> Complexes:
     """r of equation (3)."""
-    return np.asarray((zeros - poles) * (zeros.conj() - poles) / (poles.conj() - poles))
+    return (zeros - poles) * (zeros.conj() - poles) / (poles.conj() - poles)
 
 
 def _fit(f_min: float, slope: float, n: int, ends: int, sharp: float = 0.0) -> PowerLawFilter:
@@ -439,4 +439,4 @@ def _state_covariance(
         for k in range(n - more, n, 2):
             real[k : k + 2, k : k + 2] = np.array([[0.5, 0.5], [-0.5j, 0.5j]])
         covariance = (real @ covariance @ real.T).real
-    return np.asarray((covariance + covariance.T) / 2)
+    return (covariance + covariance.T) / 2

@@ -86,7 +86,7 @@ def looking(azel: Floats) -> Floats:
     """(n, 3) unit vectors north, east, up of boresights (n, 4), whose own axes are north, west,
     up.
     """
-    return np.asarray(directions(azel) * [1.0, -1.0, 1.0])
+    return directions(azel) * [1.0, -1.0, 1.0]
 
 
 def distances(observations: Sequence[Observation]) -> list[str]:

@@ -69,7 +69,7 @@ class Sweep:
 
     def turning(self, seconds: Floats) -> NDArray[np.bool_]:
         """(n,) True in turnarounds."""
-        return np.asarray(np.mod(seconds, self.leg + self.turnaround) > self.leg)
+        return np.mod(seconds, self.leg + self.turnaround) > self.leg
 
     def intervals(self, seconds: Floats, inside: NDArray[np.bool_] | bool = True) -> Intervals:
         """TOAST's intervals of the samples ``inside`` (n,). Left to right is towards larger values;

@@ -174,7 +174,7 @@ def margins(
 
 def _at_knots(frequency: Floats) -> Floats:
     """Fourier transform of (1, 4, 1) / 6, the cubic B-spline at its knots; cycles per knot."""
-    return np.asarray((2 + np.cos(2 * np.pi * frequency)) / 3)
+    return (2 + np.cos(2 * np.pi * frequency)) / 3
 
 
 def _spline(values: Floats, axis: int) -> Floats:
@@ -255,7 +255,7 @@ def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: NDArray[np.boo
 
 def _spline_transform(k: Floats, m: int) -> Floats:
     """Equation (3) at k + m for k in -1/2 .. 1/2."""
-    return np.asarray(np.sinc(k + m) ** 4 / sum(np.sinc(k + n) ** 4 for n in FOLDS))
+    return np.sinc(k + m) ** 4 / sum(np.sinc(k + n) ** 4 for n in FOLDS)
 
 
 def distinct(fwhm: Floats, tolerance: float = 1e-3) -> tuple[Floats, NDArray[np.int64]]:

@@ -307,4 +307,4 @@ def moved(image: ImageMap, centre: tuple[float, float] | None, place: str) -> Im
 def _turned(image: ImageMap, centre: tuple[float, float]) -> Floats:
     """(3, 3) from ICRS directions about ``centre`` to the image's own about its middle."""
     middle = local_axes(*(float(v) for v in angles(image.directions(image.middle))))
-    return np.asarray(image.turn @ (middle.T @ local_axes(*centre)))
+    return image.turn @ (middle.T @ local_axes(*centre))

@@ -146,7 +146,7 @@ class InputMap:
 
     def directions(self, at: Pixels) -> Floats:
         """(..., 3) ICRS directions of pixels; NaN beyond the projection."""
-        return np.asarray(self.own_directions(at) @ self.turn)
+        return self.own_directions(at) @ self.turn
 
     def planes(self, at: Pixels, axis: Floats | None) -> Floats:
         """(k, ...) I of pixels, or I, Q and U from the meridians through the ICRS direction
@@ -154,7 +154,7 @@ class InputMap:
         """
         intensity = self.values[at][None]
         if axis is None or self.polarization is None:
-            return np.asarray(intensity)
+            return intensity
         own = self.own_directions(at)
         known = np.asarray(np.isfinite(own).all(axis=-1))
         turn = between_meridians(np.where(known[..., None], own, 0.0), NORTH, self.turn @ axis)
@@ -277,7 +277,7 @@ class ImageMap(InputMap):
 
     def areas(self, at: Pixels) -> Floats:
         if self._period:  # those of a row are equal
-            return np.asarray(self._areas_of_rows[at[0]])
+            return self._areas_of_rows[at[0]]
         y, x = at
         xx, xy, yy = self.grid.metric(x, y)
         found = np.asarray(np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)))
@@ -300,7 +300,7 @@ class ImageMap(InputMap):
         u, v = self.grid.coordinates(self.own_directions(at))
         near = 0.5 if self.grid.kind != "CSC" else 5.0  # whose inverse is known to some 20 arcsec
         with np.errstate(invalid="ignore"):
-            return np.asarray((np.abs(u - x) < near) & (np.abs(v - y) < near))
+            return (np.abs(u - x) < near) & (np.abs(v - y) < near)
 
     def at(self, d: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """0-based pixels (x, y) of ICRS directions (n, 3), NaN beyond the projection, and whether

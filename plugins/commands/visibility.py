@@ -77,7 +77,7 @@ class Seen:
         )
         # periodic and smooth: two harmonics of the day
         closed = np.concatenate([found, found[:, :1]], axis=1)
-        return np.asarray(make_interp_spline([*hours, 24], closed, k=1, axis=1)(np.arange(24)))
+        return make_interp_spline([*hours, 24], closed, k=1, axis=1)(np.arange(24))
 
     def pwv_of_month(self, number: int, month: Month) -> Floats | None:
         """(3,) quantiles of the PWV [m] in the hours in which the target is up at night; None where
@@ -85,7 +85,7 @@ class Seen:
         """
         if not self.known or not month.by_hour.any():
             return None
-        return np.asarray(np.average(self.pwv_by_month[number], axis=0, weights=month.by_hour))
+        return np.average(self.pwv_by_month[number], axis=0, weights=month.by_hour)
 
     @cached_property
     def _atmospheres(self) -> dict[str, BandAtmosphere]:
@@ -356,7 +356,7 @@ def share_above(*values: Floats) -> Floats:
             cross = np.where(a == b, 0.0, a / (a - b))
         low = np.maximum(low, np.where(a > 0, 0.0, np.where(b > 0, cross, 1.0)))
         high = np.minimum(high, np.where(b > 0, 1.0, np.where(a > 0, cross, 0.0)))
-    return np.asarray(np.clip(high - low, 0.0, None))
+    return np.clip(high - low, 0.0, None)
 
 
 @dataclass(frozen=True)

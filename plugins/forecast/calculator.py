@@ -148,7 +148,7 @@ def system_flux(
         * diameter**2
         / 4
     )
-    return np.asarray(2 * BOLTZMANN * system / (FORWARD * passed) / aperture)
+    return 2 * BOLTZMANN * system / (FORWARD * passed) / aperture
 
 
 def of_survey(survey: Survey, seconds: float) -> Calculated | None:

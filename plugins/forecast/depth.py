@@ -172,11 +172,11 @@ class Depth:
         wanted = np.asarray(seconds, np.float64)
         inside = np.clip(wanted, self.seconds[0], self.seconds[-1])
         variance = np.interp(inside, self.seconds, self.seconds * self.variance[name])
-        return np.asarray(np.sqrt(variance / wanted))
+        return np.sqrt(variance / wanted)
 
     def total(self, seconds: Floats | float) -> Floats:
         """Quadratic sum of the parts that are forecast, K_RJ."""
-        return np.asarray(np.sqrt(sum(self.part(name, seconds) ** 2 for name in self.known)))
+        return np.sqrt(sum(self.part(name, seconds) ** 2 for name in self.known))
 
     def total_error(self, seconds: float) -> float:
         """Relative error of `total`, the parts' errors in quadrature."""

@@ -246,10 +246,10 @@ class Seen:
                 cure=f"choose: {', '.join(OF)}",
             )
         if of == "peak":
-            return np.asarray(abs(self.left(seconds)) / depth.total(seconds))
+            return abs(self.left(seconds)) / depth.total(seconds)
         wanted = np.asarray(seconds, np.float64)
         rate = np.interp(wanted, self.seconds, self.template**2 / self.seconds)
-        return np.asarray(np.sqrt(rate * wanted))
+        return np.sqrt(rate * wanted)
 
     def reach(self, depth: Depth, sigma: float, of: str = "peak") -> float:
         """Integration time [s] after which the signal-to-noise ratio is ``sigma``; NaN: it is not

@@ -226,7 +226,7 @@ def _signed(
 
 def _weight(spread: Floats) -> Floats:
     """1 / (A^-1)_SS, 0 where it is not known."""
-    return np.asarray(np.nan_to_num(1 / spread))
+    return np.nan_to_num(1 / spread)
 
 
 def _distance(grid: TangentGrid) -> Floats:

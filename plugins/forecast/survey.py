@@ -265,14 +265,14 @@ class Track:
     def centre(self) -> Floats:
         """(n, 2) where the boresight is, rad."""
         h = self.matrices
-        return np.asarray(h[:, (2, 5)] / h[:, 8:])
+        return h[:, (2, 5)] / h[:, 8:]
 
     @cached_property
     def turn(self) -> Floats:
         """(n, 2, 2) derivative of the position by (xi, eta) at the boresight."""
         h = self.matrices
         rows = [h[:, 3 * k : 3 * k + 2] - self.centre[:, k : k + 1] * h[:, 6:8] for k in (0, 1)]
-        return np.asarray(np.stack(rows, axis=1) / h[:, 8, None, None])
+        return np.stack(rows, axis=1) / h[:, 8, None, None]
 
 
 @dataclass

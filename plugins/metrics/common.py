@@ -84,7 +84,7 @@ def covered(product: MapProduct) -> NDArray[np.bool_]:
     """Pixels that have a value and at least `COVERED` of the usual samples."""
     seen = product.hits[product.known]
     least = COVERED * float(np.percentile(seen, 99)) if seen.size else 1.0
-    return np.asarray(np.isfinite(product.signal) & (product.hits >= max(least, 1e-9)))
+    return np.isfinite(product.signal) & (product.hits >= max(least, 1e-9))
 
 
 def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Floats:

@@ -91,27 +91,27 @@ def saturation_pressure(temperature: Floats) -> Floats:
     liquid = 611.21 * np.exp(17.502 * (t - 273.16) / (t - 32.19))
     ice = 611.21 * np.exp(22.587 * (t - 273.16) / (t + 0.7))
     share = np.clip((t - 250.16) / (273.16 - 250.16), 0, 1) ** 2
-    return np.asarray(share * liquid + (1 - share) * ice)
+    return share * liquid + (1 - share) * ice
 
 
 def from_relative(relative: Floats, pressure: Floats, temperature: Floats) -> Floats:
     """From relative humidity, 0 to 1, of the mixed-phase saturation pressure."""
-    return np.asarray(relative * saturation_pressure(temperature) / pressure)
+    return relative * saturation_pressure(temperature) / pressure
 
 
 def from_specific(specific: Floats) -> Floats:
     """From specific humidity, kg of vapour per kg of moist air."""
-    return np.asarray(specific / (EPSILON + (1 - EPSILON) * specific))
+    return specific / (EPSILON + (1 - EPSILON) * specific)
 
 
 def from_density(density: Floats, pressure: Floats, temperature: Floats) -> Floats:
     """From the mass of vapour, kg/m3."""
-    return np.asarray(density * VAPOUR_GAS_CONSTANT * temperature / pressure)
+    return density * VAPOUR_GAS_CONSTANT * temperature / pressure
 
 
 def ozone_from_mass(mass_mixing_ratio: Floats) -> Floats:
     """From kg of ozone per kg of air."""
-    return np.asarray(mass_mixing_ratio * MOLAR_MASS_DRY_AIR / MOLAR_MASS_OZONE)
+    return mass_mixing_ratio * MOLAR_MASS_DRY_AIR / MOLAR_MASS_OZONE
 
 
 def temperature(height: ArrayLike) -> Floats:
@@ -157,7 +157,7 @@ def wind_speed(above_ground: ArrayLike) -> Floats:
 def ozone(pressures: ArrayLike) -> Floats:
     """Volume mixing ratio at pressures [Pa]."""
     at = np.log(pressure(OZONE_HEIGHT))
-    return np.asarray(np.interp(-np.log(pressures), -at, OZONE))
+    return np.interp(-np.log(pressures), -at, OZONE)
 
 
 def standard_column(site: Site) -> Column:

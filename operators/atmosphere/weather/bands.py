@@ -345,7 +345,7 @@ def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSec
     nearest = low + (upper > 0.5)
 
     def linear(sections: Floats) -> Floats:
-        return np.asarray(sections[..., low] * (1 - upper) + sections[..., low + 1] * upper)
+        return sections[..., low] * (1 - upper) + sections[..., low + 1] * upper
 
     names = ("dry_air", "water", "water_self", "ozone")
     mixed = {name: linear(getattr(known, name)) for name in names}

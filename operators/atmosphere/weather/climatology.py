@@ -107,7 +107,7 @@ def climatology_column(site: Site, time: Instant) -> Column:
     basis, arrays = harmonics(*_day_and_hour(time)), coefficients(name)
 
     def median(quantity: str) -> Floats:
-        return np.asarray(basis @ arrays[quantity].astype(np.float64))
+        return basis @ arrays[quantity].astype(np.float64)
 
     every_pressure = arrays["pressure"].astype(np.float64)
     height, temperature = median("height"), median("temperature")

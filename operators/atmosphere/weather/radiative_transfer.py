@@ -134,7 +134,7 @@ class Layers:
         # positive up to 0.25, which no air holds (a source of more than 0.1 is refused), so nothing
         # is cut.
         water_section = np.maximum(k.water + water * k.water_self, 0.0)
-        return np.asarray((1 - water) * k.dry_air + water * water_section + ozone * k.ozone)
+        return (1 - water) * k.dry_air + water * water_section + ozone * k.ozone
 
     def opacity_of_water(self, cross_sections: CrossSections) -> Floats:
         """(n, n_frequency) vertical opacity that each layer gains per metre of water [neper / m of
@@ -153,7 +153,7 @@ class Layers:
     @property
     def water(self) -> Floats:
         """(n,) PWV that each layer holds, m."""
-        return np.asarray(self.molecules * self.h2o * PWV_OF_MOLECULE)
+        return self.molecules * self.h2o * PWV_OF_MOLECULE
 
     @property
     def middle(self) -> Floats:
