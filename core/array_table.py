@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from .configuration.diagnostics import nearest
 from .errors import InputError
 from .focalplane import Focalplane
-from .types import Floats
+from .types import Bools, Floats, Indices, Integers
 
 if TYPE_CHECKING:
     from .storage.table_files import Table
@@ -141,7 +141,7 @@ class ArrayTable:
         """Largest distance of a detector from the boresight, tan(rad)."""
         return float(np.hypot(self.columns["xi"], self.columns["eta"]).max())
 
-    def rows(self, band: str) -> NDArray[np.intp]:
+    def rows(self, band: str) -> Indices:
         """Rows of a band; all rows if the table has no column for it."""
         if not self.bands:
             return np.arange(len(self.names))
@@ -320,7 +320,7 @@ def _check_limits(table: Table, key: str) -> None:
     _note_values(table, key, wrong, f"give {limits}")
 
 
-def _note_values(table: Table, key: str, wrong: NDArray[np.bool_], cure: str) -> None:
+def _note_values(table: Table, key: str, wrong: Bools, cure: str) -> None:
     table.note_rows(wrong, lambda row: f"{key} is {table.texts(key)[row]}", cure)
 
 
@@ -333,7 +333,7 @@ def _check_distances(table: Table, names: Sequence[str], away: Floats) -> None:
     )
 
 
-def _numbered(texts: Sequence[str]) -> NDArray[np.int64]:
+def _numbered(texts: Sequence[str]) -> Integers:
     """Whole numbers as they are; names by their place in the alphabet."""
     try:
         return np.array([int(text) for text in texts], np.int64)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, create_model, model_validator
 
 from .configuration.diagnostics import mistake, refusal
@@ -16,6 +15,7 @@ from .configuration.units import Angle, Fraction, Hertz, KelvinRootSecond, Radio
 from .errors import InputError
 from .registry import RegistryError, bands
 from .storage.table_files import NUMBERED, read_table
+from .types import Floats
 
 SPEED_OF_LIGHT = 299792458.0
 
@@ -37,7 +37,7 @@ class Band(Parameters):
     provenance: str = ""
     """Source of these numbers."""
 
-    _table: tuple[NDArray[np.float64], NDArray[np.float64]] = PrivateAttr()
+    _table: tuple[Floats, Floats] = PrivateAttr()
 
     def _as_argument(self) -> str:
         return named_or_written(self, bands)
@@ -64,12 +64,12 @@ class Band(Parameters):
         return hash((self.name, self.low, self.high, self.file))
 
     @property
-    def frequency(self) -> NDArray[np.float64]:
+    def frequency(self) -> Floats:
         """(n,) Hz, increasing."""
         return self._table[0]
 
     @property
-    def transmission(self) -> NDArray[np.float64]:
+    def transmission(self) -> Floats:
         """(n,) relative transmission, peak 1."""
         return self._table[1]
 
@@ -132,7 +132,7 @@ ALIASES = {
 """Names of columns in published passbands, in small letters."""
 
 
-def _read_passband(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _read_passband(path: Path) -> tuple[Floats, Floats]:
     """Frequency [Hz], rising, and transmission of peak 1. Negative values are kept: the noise of a
     spectrometer is as often below zero as above, and its mean must stay zero.
     """

@@ -8,14 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import PluginError
 from .log import Log
 from .numerics.smooth import SmoothField
 from .observation import Observation
 from .signal import MAIN, Component, Entrance
-from .types import AnyFloats
+from .types import AnyFloats, Floats
 
 STREAMS = ("sky", "atmosphere", "transmission", "white", "pink", "signal")
 """Streams that zonda's own operators make in every block: the components, and their calibrated sum.
@@ -152,7 +151,7 @@ class Block:
             held = self.buffers[key] = np.empty(size, self.dtype)
         return held[:size].reshape(shape)
 
-    def total(self, name: str) -> NDArray[np.float64]:
+    def total(self, name: str) -> Floats:
         """Stream plus its mean, float64: (n_det_block, n_samp_block). A copy."""
         whole = self.detdata[name].astype(np.float64)
         if name in self.means:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .block import STREAMS, Block
 from .canvas import shown_axes
@@ -18,6 +17,7 @@ from .observation import Observation
 from .product import Product
 from .stream import Stream, in_order, unit_of_stream
 from .tables import html_table
+from .types import Floats
 
 if TYPE_CHECKING:
     from .scene import Scene
@@ -263,7 +263,7 @@ class Data:
         stream: str = "signal",
         scan: str | int | None = None,
         detectors: int = 64,
-    ) -> Iterator[tuple[Observation, slice, NDArray[np.float64]]]:
+    ) -> Iterator[tuple[Observation, slice, Floats]]:
         """(observation, detectors, part of `tod`) of one scan, or of all, at most so many
         ``detectors`` at a time.
         """
@@ -379,7 +379,7 @@ def one_scan(observations: Sequence[Observation], scan: str | int | None) -> Obs
     raise InputError(f"there is no scan {scan!r}", place="data.tod", cure=cure)
 
 
-def kept(observation: Observation, stream: str, rows: slice = slice(None)) -> NDArray[np.float64]:
+def kept(observation: Observation, stream: str, rows: slice = slice(None)) -> Floats:
     """These detectors of a kept stream, with the mean that belongs to it. Raises InputError where
     it was not kept.
     """

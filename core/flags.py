@@ -25,13 +25,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .types import AnyFloats
+from .types import AnyFloats, Bools
 
 Intervals = dict[str, list[tuple[float, float]]]
 """Intervals by name: (start, stop) [s], in order and disjoint."""
 
 
-def intervals_of(inside: NDArray[np.bool_], seconds: AnyFloats) -> list[tuple[float, float]]:
+def intervals_of(inside: Bools, seconds: AnyFloats) -> list[tuple[float, float]]:
     """The intervals of those samples (n,) that are ``inside``, taken at ``seconds`` (n,).
 
     A run of the last sample alone has no length, and is left out: TOAST's rule gives that sample to
@@ -49,7 +49,7 @@ def slices_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> list[slic
     return [slice(first, last + (last == len(seconds) - 1)) for first, last in found]
 
 
-def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> NDArray[np.bool_]:
+def samples_in(spans: list[tuple[float, float]], seconds: AnyFloats) -> Bools:
     """(n,) True for the samples in any of the intervals ``spans``."""
     inside = np.zeros(len(seconds), bool)
     for samples in slices_in(spans, seconds):
@@ -164,7 +164,7 @@ TRIMMED_INTERVALS = "zonda_trimmed"
 """Name of the intervals of a file in which *processing* means `TRIMMED`."""
 
 
-def good(flags: Flags, exclude: int) -> NDArray[np.bool_]:
+def good(flags: Flags, exclude: int) -> Bools:
     """Mask of elements with none of the bits ``exclude``."""
     return np.asarray((flags & np.uint8(exclude)) == 0, np.bool_)
 
@@ -177,14 +177,14 @@ def in_file(flags: Flags, table: tuple[Flag, ...]) -> Flags:
     return found
 
 
-def has_a_signal(flags: Flags) -> NDArray[np.bool_]:
+def has_a_signal(flags: Flags) -> Bools:
     """Samples in which filters take the signal as it is: those that maps use, turnarounds, and
     those that a filter of this run trims.
     """
     return good(flags, EXCLUDE_SAMPLE & ~HAS_A_SIGNAL)
 
 
-def from_file(flags: Flags, mask: int, trimmed: NDArray[np.bool_] | None = None) -> Flags:
+def from_file(flags: Flags, mask: int, trimmed: Bools | None = None) -> Flags:
     """Flags of samples as a file in TOAST's layout has them; only those with a bit of ``mask`` are
     excluded.
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import InputError
 from .tables import html_table
-from .types import Floats
+from .types import Floats, Indices, Integers
 
 DEFAULTS: dict[str, float] = {
     "polarization_angle": 0.0,
@@ -75,12 +74,12 @@ class Focalplane:
     net: Floats
     polarization_angle: Floats = field(default_factory=lambda: np.zeros(0))
     polarization_efficiency: Floats = field(default_factory=lambda: np.zeros(0))
-    band: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    wafer: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    band: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    wafer: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
     knee: Floats = field(default_factory=lambda: np.zeros(0))
     slope: Floats = field(default_factory=lambda: np.zeros(0))
     minimum_frequency: Floats = field(default_factory=lambda: np.zeros(0))
-    dead: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    dead: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -174,7 +173,7 @@ class Focalplane:
         """
         return Focalplane(**{f.name: getattr(self, f.name).copy() for f in fields(self)})
 
-    def rows(self, index: NDArray[np.intp]) -> Focalplane:
+    def rows(self, index: Indices) -> Focalplane:
         """A focal plane of some of the detectors, copied in this order."""
         found = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "names"}
         return Focalplane([self.names[row] for row in index], **found)

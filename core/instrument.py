@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     Field,
     ModelWrapValidatorHandler,
@@ -42,7 +41,7 @@ from .focalplane import Focalplane
 from .layouts import Layout, hexagonal_packing, rings, wafers
 from .numerics.random import stream_key, uniforms
 from .registry import RegistryError, bands, instruments, layouts
-from .types import Floats
+from .types import Floats, Integers
 from .variants import LIKE, is_variant, variant
 
 __all__ = ["SPEED_OF_LIGHT", "Band", "CameraBand", "Instrument", "Telescope", "hexagonal_packing"]
@@ -458,7 +457,7 @@ class Instrument(ParametersWithYield):
             **{key: np.full(n, value) for key, value in stated.items()},
         )
 
-    def _dead(self, number: int) -> NDArray[np.int64]:
+    def _dead(self, number: int) -> Integers:
         """1 for the detectors (number,) that give no data, by `yield`: the same in each run."""
         alive = max(1, round(number * getattr(self, "yield")))
         drawn = uniforms(stream_key(0, *self.identity, "yield"), 0, number)

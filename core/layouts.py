@@ -8,9 +8,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .types import Floats
+from .types import Floats, Indices, Integers
 
 GAP = 0.03
 """Distance between the edges of wafers, beyond one pitch, in units of the distance between their
@@ -41,7 +40,7 @@ class Layout:
 
     x: Floats
     y: Floats
-    wafer: NDArray[np.int64]
+    wafer: Integers
     angle: Floats | None = None
     radius: float | None = None
 
@@ -51,7 +50,7 @@ class Layout:
         return float(np.hypot(self.x, self.y).max()) if self.radius is None else self.radius
 
 
-def hexagonal_packing(n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def hexagonal_packing(n: int) -> tuple[Floats, Floats]:
     """The ``n`` points of a unit-pitch hexagonal lattice nearest its origin. Two arrays (n,),
     nearest first.
     """
@@ -89,7 +88,7 @@ def hexagon(n: int) -> tuple[Floats, Floats]:
     return x[order], y[order]
 
 
-def wafers(n: int, number: int) -> tuple[Floats, Floats, NDArray[np.int64]]:
+def wafers(n: int, number: int) -> tuple[Floats, Floats, Integers]:
     """``n`` points shared equally by ``number`` hexagonal wafers, edge to edge about the origin: x,
     y and the wafer of each.
 
@@ -120,7 +119,7 @@ def _compact(n: int) -> tuple[Floats, Floats]:
     return min(found, key=lambda one: round(one[0], 9))[1:]
 
 
-def _order(n: int, x: Floats, y: Floats, distance: Floats) -> NDArray[np.intp]:
+def _order(n: int, x: Floats, y: Floats, distance: Floats) -> Indices:
     """The ``n`` points of the least ``distance``, of equal ones those of the least angle first."""
     return np.lexsort((np.round(np.arctan2(y, x), 9), np.round(distance, 9)))[:n]
 

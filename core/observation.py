@@ -17,7 +17,7 @@ from .log import Log
 from .numerics.random import stream_key
 from .numerics.smooth import SmoothField
 from .tables import html_table
-from .types import AnyFloats, Floats
+from .types import AnyFloats, Bools, Floats, Indices, Integers
 
 if TYPE_CHECKING:
     from .configuration.time import Instant
@@ -67,10 +67,10 @@ class WhiteLevel(Protocol):
     def follows_load(self) -> bool:
         """True if it depends on the mean emission or transmission of the atmosphere."""
 
-    def sky_net(self, observation: Observation) -> NDArray[np.float64]:
+    def sky_net(self, observation: Observation) -> Floats:
         """(n_det,) K_RJ sqrt(s) on the sky, once every step is configured."""
 
-    def expected_sky_net(self, observation: Observation) -> NDArray[np.float64]:
+    def expected_sky_net(self, observation: Observation) -> Floats:
         """About what `sky_net` will be, before."""
 
     def amplitude(self, observation: Observation) -> SmoothField:
@@ -92,11 +92,11 @@ class ClosedForm:
         the densities (n, m) of waves between these; None: detectors have `shared` in common.
     """
 
-    spectrum: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+    spectrum: Callable[[Floats], Floats]
     shared: float = 0.0
-    across: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]] | None = None
+    across: Callable[[Floats, Floats], Floats] | None = None
 
-    def __call__(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, frequency: Floats) -> Floats:
         """See ``spectrum``."""
         return self.spectrum(frequency)
 
@@ -240,10 +240,10 @@ class Observation:
     instrument: Instrument
     focalplane: Focalplane
     start: Instant
-    seconds: NDArray[np.float64]
+    seconds: Floats
     sample_rate: float
-    boresight_azel: NDArray[np.float64]
-    boresight_radec: NDArray[np.float64]
+    boresight_azel: Floats
+    boresight_radec: Floats
     centre: tuple[float, float]
     seed: int
     flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
@@ -254,7 +254,7 @@ class Observation:
     detdata: KeptStreams = field(default_factory=KeptStreams)
     noise_levels: dict[str, WhiteLevel] = field(default_factory=dict)
     closed_forms: dict[str, list[ClosedForm]] = field(default_factory=dict)
-    quoted_net: NDArray[np.float64] | None = None
+    quoted_net: Floats | None = None
     log: Log = field(default_factory=Log)
     output: Any = None
     expected_load: Callable[[], tuple[float, float]] | None = None
@@ -262,10 +262,10 @@ class Observation:
     components: frozenset[str] = frozenset()
     signals: tuple[str, ...] = ("signal",)
     unfiltered: frozenset[str] = frozenset()
-    windows: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    hwp_angle: NDArray[np.float64] | None = None
-    pointed_radec: NDArray[np.float64] | None = None
-    recorded_azimuth: NDArray[np.float64] | None = None
+    windows: dict[str, Floats] = field(default_factory=dict)
+    hwp_angle: Floats | None = None
+    pointed_radec: Floats | None = None
+    recorded_azimuth: Floats | None = None
     common: dict[Hashable, Any] | None = None
     seen_of: tuple[int, float] | None = None
 
@@ -285,7 +285,7 @@ class Observation:
     def n_detectors(self) -> int:
         return len(self.focalplane)
 
-    def expected_net(self) -> NDArray[np.float64]:
+    def expected_net(self) -> Floats:
         """(n_det,) about what ``focalplane.net`` will be once the steps with white noise are
         prepared.
         """
@@ -298,17 +298,17 @@ class Observation:
         return self.instrument.telescope.name, self.instrument.name, self.site.name
 
     @property
-    def good_samples(self) -> NDArray[np.bool_]:
+    def good_samples(self) -> Bools:
         """(n_samp,) True where no flag excludes the sample."""
         return good(self.flags, EXCLUDE_SAMPLE)
 
     @property
-    def good_detectors(self) -> NDArray[np.bool_]:
+    def good_detectors(self) -> Bools:
         """(n_det,) True where no flag excludes the detector."""
         return good(self.detector_flags, EXCLUDE_DETECTOR)
 
     @property
-    def window(self) -> NDArray[np.float64] | None:
+    def window(self) -> Floats | None:
         """(n_samp,) product of `windows`, 0 to 1, by which maps weigh samples; None: there is
         none.
         """
@@ -404,7 +404,7 @@ class Observation:
         return found
 
     @property
-    def departures(self) -> NDArray[np.float64]:
+    def departures(self) -> Floats:
         """(n_samp,) s by which samples are later than a comb of `sample_rate` with the same mean;
         zeros for a perfect one.
         """
@@ -417,17 +417,17 @@ class Observation:
         late = self.departures
         return float(np.sqrt(np.mean(late * late)))
 
-    def seconds_at(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+    def seconds_at(self, index: Integers) -> Floats:
         """`seconds` at sample numbers, which go on at `sample_rate` beyond the ends of the scan."""
         inside = np.clip(index, 0, self.n_samples - 1)
         return np.asarray(self.seconds[inside] + (index - inside) / self.sample_rate, np.float64)
 
     @property
-    def sky_boresight(self) -> NDArray[np.float64]:
+    def sky_boresight(self) -> Floats:
         """(n_samp, 4) as `boresight_radec`: where the telescope in fact looks on the sky."""
         return self.boresight_radec if self.pointed_radec is None else self.pointed_radec
 
-    def thinned(self, at: slice | NDArray[np.intp]) -> Observation:
+    def thinned(self, at: slice | Indices) -> Observation:
         """The scan at some of its samples alone."""
         each = ("seconds", "boresight_azel", "boresight_radec", "flags",
                 "recorded_azimuth", "hwp_angle", "pointed_radec")  # fmt: skip

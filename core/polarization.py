@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from .kernels import kernel
 from .numerics.projection import rotation_matrices
 from .numerics.quaternions import detector_quaternions
-from .types import AnyFloats, Floats
+from .types import AnyFloats, Floats, Indices
 
 if TYPE_CHECKING:
     from .observation import Observation
@@ -82,7 +82,7 @@ class PolarizationAngles(NamedTuple):
     def nbytes(self) -> int:
         return sum(part.nbytes for part in self)
 
-    def fill(self, detectors: NDArray[np.intp], start: int, cosine: Floats, sine: Floats) -> None:
+    def fill(self, detectors: Indices, start: int, cosine: Floats, sine: Floats) -> None:
         """cos 2 psi and sin 2 psi of ``detectors`` (numbers, n) from sample ``start`` on, into
         arrays (n, m).
 
@@ -93,11 +93,11 @@ class PolarizationAngles(NamedTuple):
 
     def add(
         self,
-        detectors: NDArray[np.intp],
+        detectors: Indices,
         start: int,
         efficiency: Floats,
         q_and_u: tuple[AnyFloats, AnyFloats],
-        rows: NDArray[np.intp],
+        rows: Indices,
         out: AnyFloats,
     ) -> None:
         """Add p (Q cos 2 psi + U sin 2 psi), equation (1), to ``rows`` (n,) of ``out`` (n_row, m).

@@ -38,6 +38,7 @@ from .product import Product
 from .scene import Scene
 from .signal import is_stream
 from .site import Site
+from .types import Floats
 
 N_DETECTORS, N_SAMPLES, RATE = 37, 3 * TILE_SAMPLES + 321, 50.0
 
@@ -91,7 +92,7 @@ MEAN_STEP = 256
 """Samples between the coefficients of the made-up mean."""
 
 
-def slow(n_samples: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def slow(n_samples: int) -> tuple[Floats, Floats]:
     """Weights (detector, node) and node values of a mean: 30 K and more, falling by 0.3 K in a
     straight line.
     """
@@ -326,7 +327,7 @@ def check_linear(operator: Operator) -> None:
         operator.measure(_stream(observation, whole, state)) if operator.couples == "all" else None
     )
 
-    def act(signal: NDArray[np.float32], own: Any = None) -> NDArray[np.float64]:
+    def act(signal: NDArray[np.float32], own: Any = None) -> Floats:
         block = Block(
             observation,
             slice(0, N_DETECTORS),

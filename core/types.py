@@ -10,3 +10,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 AnyFloats = NDArray[np.floating[Any]]
 """float32 or float64."""
+Bools = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+Indices = NDArray[np.intp]

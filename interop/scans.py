@@ -10,11 +10,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Data, Observation, kept, one_scan
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_MASK
+from zonda.core.types import Bools, Floats
 from zonda.operators.io.recorded_stream import RecordedStream
 from zonda.operators.io.save_tod import reader
 from zonda.operators.io.time_ordered_data import TimeOrderedData
@@ -42,7 +42,7 @@ class Scan:
 
     tod: TimeOrderedData
     stream: str
-    spoilt: NDArray[np.bool_]
+    spoilt: Bools
 
 
 def scan_of(source: Source, stream: str = "signal", scan: str | int | None = None) -> Scan:
@@ -95,7 +95,7 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
 def _read(
     path: str | os.PathLike[str],
     stream: str,
-) -> tuple[TimeOrderedData, NDArray[np.float64], NDArray[np.bool_] | None]:
+) -> tuple[TimeOrderedData, Floats, Bools | None]:
     """Read a file without its other streams, and the single samples that it flags."""
     opened = reader(path)
     try:

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from astropy.wcs import WCS
-from numpy.typing import NDArray
 
 from ..numerics.projection import (
     central,
@@ -29,7 +28,7 @@ from ..numerics.projection import (
 )
 from ..numerics.sphere import angles, separation, unit_vectors
 from ..storage.fits_files import COMMENTARY, header_of
-from ..types import Floats
+from ..types import Bools, Floats, Integers
 
 CYLINDERS = ("CAR", "CEA", "MER", "CYP")
 ROWS = 256
@@ -63,7 +62,7 @@ class MapGrid:
         raise NotImplementedError
 
     @property
-    def once(self) -> NDArray[np.bool_]:
+    def once(self) -> Bools:
         """Pixels that are on the sky and repeat no other one (as columns of CAR beyond 360 deg do);
         broadcasts to `shape`.
         """
@@ -80,7 +79,7 @@ class MapGrid:
         """(*shape, 3) unit vectors in the grid's frame; NaN for pixels that are not on the sky."""
         raise NotImplementedError
 
-    def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
+    def pixels_at(self, directions: Floats) -> Integers:
         """Flat places (...) of the pixels that hold directions (..., 3) of the grid's frame, -1
         where there is none.
         """
@@ -100,7 +99,7 @@ class MapGrid:
         found.flags.writeable = False
         return found
 
-    def solid_angle(self, where: NDArray[np.bool_]) -> float:
+    def solid_angle(self, where: Bools) -> float:
         """Solid angle of the pixels ``where`` [sr], each piece of the sky counted once."""
         areas = np.where(self.once, self.areas, 0.0)
         return float(np.broadcast_to(areas, self.shape)[where].sum())
@@ -264,7 +263,7 @@ class ImagePixels(MapGrid):
         return np.where(found > 0, found, np.nan)
 
     @property
-    def once(self) -> NDArray[np.bool_]:
+    def once(self) -> Bools:
         found = np.asarray(np.isfinite(self.areas))
         if 0 < self.around < self.shape[1]:
             found = found & (np.arange(self.shape[1]) < self.around)
@@ -304,7 +303,7 @@ class ImagePixels(MapGrid):
             x = x - turn * np.floor((x + 0.5) / turn)
         return x, y
 
-    def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
+    def pixels_at(self, directions: Floats) -> Integers:
         x, y = self.coordinates(directions)
         ny, nx = self.shape
         with np.errstate(invalid="ignore"):
@@ -348,7 +347,7 @@ class HealpixPixels(MapGrid):
 
     nside: int
     nest: bool
-    pixels: NDArray[np.int64]
+    pixels: Integers
     frame: str = "icrs"
 
     @property
@@ -364,7 +363,7 @@ class HealpixPixels(MapGrid):
         return np.array([math.pi / (3 * self.nside**2)])
 
     @property
-    def once(self) -> NDArray[np.bool_]:
+    def once(self) -> Bools:
         return np.ones(1, np.bool_)
 
     @property
@@ -377,7 +376,7 @@ class HealpixPixels(MapGrid):
 
         return np.stack(healpy.pix2vec(self.nside, self.pixels, nest=self.nest), axis=-1)
 
-    def pixels_at(self, directions: Floats) -> NDArray[np.int64]:
+    def pixels_at(self, directions: Floats) -> Integers:
         import healpy
 
         wanted = np.asarray(

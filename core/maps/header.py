@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 from astropy.io.fits import Header
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..storage.fits_files import COMMENTARY, header_of
-from ..types import AnyFloats
+from ..types import AnyFloats, Bools
 
 FRAMES = ("ICRS", "FK5", "FK4", "FK4-NO-E")
 """Values of RADESYS that are read (FITS 4.0, table 24, without GAPPT: apparent places, which depend
@@ -96,7 +95,7 @@ UNSEEN = -1.6375e30
 """Value of pixels that HEALPix's tools did not see."""
 
 
-def marked_bad(values: AnyFloats, header: FileHeader) -> NDArray[np.bool_]:
+def marked_bad(values: AnyFloats, header: FileHeader) -> Bools:
     """True for values that a map's file marks as not observed: `UNSEEN`, and that of the card
     BAD_DATA. NaN is not among them.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..configuration.diagnostics import nearest
 from ..errors import InputError
 from ..numerics.sphere import separation, unit_vectors
-from ..types import AnyFloats, Floats
+from ..types import AnyFloats, Bools, Floats, Integers
 from .grid import HealpixPixels, ImagePixels, image_grid
 from .planes import IQU, KNOWN, Plane, Polarization, Rows
 
@@ -176,7 +176,7 @@ class MapArrays:
     noise_from: Literal["net", "scatter", "streams", "table"] = "net"
     nside: int = 0
     nest: bool = False
-    pixels: NDArray[np.int64] | None = None
+    pixels: Integers | None = None
     fwhm: float = 0.0
     smoothed_by: float = 0.0
     scans: Sequence[str] = ()
@@ -193,7 +193,7 @@ class MapArrays:
     spectral_index: float | None = None
 
     signal = Rows[Floats]("signal")
-    hits = Rows[NDArray[np.int64]]("hits")
+    hits = Rows[Integers]("hits")
     weights = Rows[Floats]("weights")
     noise = Rows[Floats]("noise")
     half_difference = Rows["Floats | None"]("half_difference")
@@ -344,7 +344,7 @@ class MapArrays:
         return WCS(self.header)
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Bools:
         """Pixels in which the map has a value: those with samples and, of a polarized map, enough
         of their angles.
         """
@@ -352,7 +352,7 @@ class MapArrays:
         return hit if self.contents == "hits" else hit & np.isfinite(self.signal)
 
     @property
-    def known_hits(self) -> NDArray[np.int64]:
+    def known_hits(self) -> Integers:
         """``hits`` where the map has a value, else 0."""
         return np.where(self.known, self.hits, 0)
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..numerics.sphere import FWHM_PER_SIGMA, angle_text, sides_text
 from ..tables import html_table
-from ..types import Floats
+from ..types import Bools, Floats, Integers
 from .map_arrays import MapArrays
 from .planes import Plane, central_diameter
 from .smoothing import CUT, error_of_mean, smoother, weighted_mean
@@ -280,7 +279,7 @@ class MapProduct(MapArrays):
         return html_table("Map", rows)
 
 
-def _rms(values: Floats, weights: Floats, where: NDArray[np.bool_]) -> float:
+def _rms(values: Floats, weights: Floats, where: Bools) -> float:
     use = where & np.isfinite(values)
     w = weights[use]
     return (
@@ -300,7 +299,7 @@ def _cut(header: Any, rows: int, columns: int) -> Any:
     return found
 
 
-def _around(places: NDArray[np.int64], reach: int) -> slice:
+def _around(places: Integers, reach: int) -> slice:
     """From ``reach`` before the first to ``reach`` behind the last."""
     return (
         slice(max(0, int(places[0]) - reach), int(places[-1]) + reach + 1)

@@ -12,10 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..types import Floats
+from ..types import Floats, Integers
 from .header import FileHeader, is_celestial, marked_bad, with_known_frame
 
 Frame = Literal["icrs", "galactic", "barycentricmeanecliptic"]
@@ -435,7 +434,7 @@ class HealpixTable(FileHeader):
         self,
         columns: Mapping[str, int],
         header_alone: bool = False,
-    ) -> tuple[dict[str, Floats], NDArray[np.int64] | None, int]:
+    ) -> tuple[dict[str, Floats], Integers | None, int]:
         """Values (n,) of ``columns``, the first of which is I, in the order of their pixels; the
         pixels' numbers (None: value k is pixel k); nside.
 
@@ -466,7 +465,7 @@ class HealpixTable(FileHeader):
             raise self.error(f"its column {self.names[column]} holds no numbers", cure)
         return np.array(found, np.float64).ravel()
 
-    def _pixels(self, nside: int, n: int) -> NDArray[np.int64] | None:
+    def _pixels(self, nside: int, n: int) -> Integers | None:
         """The numbers of the pixels of ``n`` values."""
         if (column := self.pixel_column) is None:
             return None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..numerics.sphere import ARCMIN
-from ..types import Floats
+from ..types import Floats, Integers
 
 ACROSS = 5.0
 """Beams and pixels across the circle, at least: an rms of fewer beams is known to no better than a
@@ -318,5 +318,5 @@ class Polarization:
     covariance = Rows[Floats]("covariance", slice(None))
     weights = Rows[Floats]("weights", slice(1, None))
     condition = Rows[Floats]("condition")
-    hits = Rows[NDArray[np.int64]]("hits")
+    hits = Rows[Integers]("hits")
     half_difference = Rows["Floats | None"]("half_difference", slice(1, None))

@@ -15,12 +15,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..kernels import kernel
 from ..numerics.sphere import FWHM_PER_SIGMA, angle_text
-from ..types import AnyFloats, Floats
+from ..types import AnyFloats, Bools, Floats
 from .grid import ROWS, HealpixPixels, ImagePixels, MapGrid
 
 
@@ -159,7 +158,7 @@ def error_of_mean(
     convolve: Smoother,
     noise: Floats,
     weights: Floats,
-    known: NDArray[np.bool_],
+    known: Bools,
     total: Floats,
 ) -> Floats:
     """Equation (3): standard error of `weighted_mean` for independent ``noise`` in the pixels; NaN
@@ -313,7 +312,7 @@ def _even_steps(grid: ImagePixels) -> tuple[float, float] | None:
 def _directly(
     grid: ImagePixels,
     sigma: float,
-    where: NDArray[np.bool_] = np.ones((1, 1), np.bool_),
+    where: Bools = np.ones((1, 1), np.bool_),
 ) -> Smoother:
     """Equation (2) as it stands, of the pixels ``where`` (others are 0): each with its own kernel.
     InputError beyond `MOST_DIRECT` pairs.

@@ -8,9 +8,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..types import Floats
+from ..types import Bools, Floats
 from .chunks import empty
 from .sphere import angles
 
@@ -62,7 +61,7 @@ def directions(a: Floats) -> Floats:
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 
 
-def middle(radec: Floats, good: NDArray[np.bool_]) -> tuple[float, float]:
+def middle(radec: Floats, good: Bools) -> tuple[float, float]:
     """(ra, dec) [rad] of the mean direction of the boresights that are ``good`` (n,)."""
     use = np.flatnonzero(good) if good.any() else np.arange(len(good))
     ra, dec = angles(directions(radec[use[:: max(1, len(use) // 10_000)]]).mean(axis=0))

@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from ..kernels import kernel
-from ..types import AnyFloats
+from ..types import AnyFloats, Floats
 from .columns import fused
 
 PAD = 1
@@ -54,7 +53,7 @@ def spline_coefficients(values: AnyFloats, dtype: type = np.float64) -> AnyFloat
     return out
 
 
-def interpolating(values: AnyFloats) -> NDArray[np.float64]:
+def interpolating(values: AnyFloats) -> Floats:
     """Cubic B-spline coefficients (n, m) of rows of values (n, m), mirrored about their first and
     their last: exact.
     """
@@ -69,13 +68,13 @@ def interpolating(values: AnyFloats) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=2)
-def _inverse_taps(reach: int) -> NDArray[np.float64]:
+def _inverse_taps(reach: int) -> Floats:
     """One-sided inverse of (1, 4, 1) / 6, (``reach`` + 1,)."""
     taps = np.sqrt(3.0) * (np.sqrt(3.0) - 2.0) ** np.arange(reach + 1)
     return np.asarray(taps / (taps[0] + 2 * taps[1:].sum()), np.float64)
 
 
-def spline_basis(u: NDArray[np.float64]) -> NDArray[np.float64]:
+def spline_basis(u: Floats) -> Floats:
     """The four cubic B-splines that reach a point of a cell, at ``u`` (n,), 0 to 1 of the way
     through it: (4, n).
     """
@@ -206,7 +205,7 @@ class SmoothField:
             c = finer[:, : -(-self.n_samples // now) + 3]
         return SmoothField(self.weights, np.ascontiguousarray(c), now, self.n_samples)
 
-    def time_mean(self) -> NDArray[np.float64]:
+    def time_mean(self) -> Floats:
         """(n_det,) mean over the scan."""
         return np.asarray(self.weights @ self.coefficients.mean(1), np.float64)
 
@@ -263,7 +262,7 @@ class FieldSums:
         return self._made[key][1]
 
 
-def product(rows: AnyFloats, matrix: AnyFloats) -> NDArray[np.float64]:
+def product(rows: AnyFloats, matrix: AnyFloats) -> Floats:
     """Rows (n, m) times a small matrix (m, k), (n, k): not by BLAS, whose bits in one row depend on
     how many there are and where it stands among them."""
     out = np.empty((len(rows), matrix.shape[1]))

@@ -37,6 +37,7 @@ from ..experiment.variant import Variant
 from ..mapmaker import made_by
 from ..signal import Signal
 from ..tables import aligned
+from ..types import Floats
 from .bounds import Choice, Context, add, figure
 from .decide import Decided
 from .planner import NAME
@@ -317,7 +318,7 @@ class _Result:
         relative to; with modes of its own, where the pipeline asks for that.
     """
 
-    signal: list[NDArray[np.float64]]
+    signal: list[Floats]
     map: Any
     sky: Any = None
     given: Any = None

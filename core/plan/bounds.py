@@ -11,7 +11,6 @@ from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..assembly.signals import Chain
 from ..data import Observation
@@ -20,7 +19,7 @@ from ..numerics.radiation import LEAST_TRANSMISSION
 from ..numerics.smooth import SmoothField
 from ..operator import Operator
 from ..scene import Scene
-from ..types import Floats
+from ..types import Floats, Indices
 
 METRICS = {
     "map_rms": "rms error of a map pixel, K",
@@ -181,7 +180,7 @@ class Traits:
     """
 
     noise: float = 0.0
-    each: NDArray[np.float64] | None = None
+    each: Floats | None = None
     rms: float = 0.0
     faster: Callable[[float], float] | None = None
     peak: float | None = None
@@ -514,7 +513,7 @@ class Context:
         return {"peak": share * self.peak, "transfer": share}
 
 
-def evenly(number: int, most: int) -> NDArray[np.intp]:
+def evenly(number: int, most: int) -> Indices:
     """At most so many numbers from 0 to ``number`` - 1, evenly spaced, with first and last."""
     return np.linspace(0, number - 1, min(most, number)).astype(int)
 

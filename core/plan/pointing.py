@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..assembly.signals import note_signals
 from ..data import Data, Observation
@@ -22,7 +21,7 @@ from ..output import Output
 from ..pipeline import Pipeline, of_one_band, points
 from ..scene import Scene
 from ..signal import MAIN, is_stream
-from ..types import Floats
+from ..types import Floats, Indices, Integers
 from .bounds import Context, Coverage, Depth, evenly
 from .planning import planning_of
 from .structure import Structure, chain_of
@@ -169,7 +168,7 @@ def _metrics(pipeline: Pipeline, structure: Structure, context: Context) -> froz
     return frozenset(found | {"tod", "psd"} if context.readers else found)
 
 
-def speeds(o: Observation, at: NDArray[np.intp]) -> Floats:
+def speeds(o: Observation, at: Indices) -> Floats:
     """Speed of the boresight on the sky from each of these samples to the next, rad/s."""
     both = np.stack([at, at + 1], axis=1) if o.n_samples > 1 else np.zeros((0, 2), int)
     ends = boresights(o.boresight_radec[both.ravel()]).reshape(3, -1, 2)
@@ -212,7 +211,7 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     return Coverage(max(float(deep), 1.0), pixel, median, exact)
 
 
-def _numbers(where: Floats, pixel: float) -> NDArray[np.int64]:
+def _numbers(where: Floats, pixel: float) -> Integers:
     """(n,) number of the pixel that each point (2, n) falls in."""
     index = np.floor(where / pixel).astype(np.int64)
     index -= index.min(axis=1, keepdims=True)

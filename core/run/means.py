@@ -18,14 +18,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..data import Block, Observation, Stream
 from ..mapmaker import MapMaker
 from ..numerics.smooth import SmoothField
 from ..operator import Operator
 from ..signal import MAIN
-from ..types import AnyFloats
+from ..types import AnyFloats, Floats
 
 EMISSION = "atmosphere"
 """The stream whose mean is in ``observation.smooth``, where calibration and noise models find it,
@@ -150,7 +149,7 @@ class MeansOfBands:
     def __init__(self, fields: Sequence[tuple[SmoothField | None, slice]]) -> None:
         self._fields = fields
 
-    def evaluate(self, detectors: slice, samples: slice) -> NDArray[np.float64]:
+    def evaluate(self, detectors: slice, samples: slice) -> Floats:
         """Values of all bands on a rectangle (n_det_block, n_samp_block), as of `SmoothField`."""
         shape = detectors.stop - detectors.start, samples.stop - samples.start
         found = np.zeros(shape)

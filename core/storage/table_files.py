@@ -22,10 +22,10 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 from astropy import table as astropy_table
-from numpy.typing import NDArray
 
 from ..configuration.time import Instant
 from ..errors import InputError
+from ..types import Bools, Floats
 from . import fits_files
 from .files import UNPACKED_MAX, atomic_path, first_bytes, reading, too_large, unpacked
 
@@ -155,7 +155,7 @@ class Table:
 
     def note_rows(
         self,
-        wrong: NDArray[np.bool_],
+        wrong: Bools,
         message: str | Callable[[int], str],
         cure: str,
     ) -> None:
@@ -186,13 +186,13 @@ class Table:
         self.note(-1, f"has no column {name!r}", f"it has: {', '.join(self.columns)}")
         return [""] * len(self)
 
-    def values(self, name: str) -> NDArray[np.float64]:
+    def values(self, name: str) -> Floats:
         """A column as numbers, in the unit in which it is written; NaN for another text."""
         column = self.columns[name][0]
         numbers = [_number(text) for text in column] if isinstance(column, list) else column
         return np.asarray(numbers, np.float64)
 
-    def numbers(self, name: str, unit: str = "", empty: float | None = None) -> NDArray[np.float64]:
+    def numbers(self, name: str, unit: str = "", empty: float | None = None) -> Floats:
         """A column of finite numbers, in ``unit``; where that is empty, the column has none.
 
         A column that is not there, has no unit or one of another kind, and every row that is not a
@@ -212,7 +212,7 @@ class Table:
         )
         return np.where(blank, np.nan if empty is None else empty, values * factor)
 
-    def angles(self, name: str, *, hours: bool = False, gaps: bool = False) -> NDArray[np.float64]:
+    def angles(self, name: str, *, hours: bool = False, gaps: bool = False) -> Floats:
         """A column of angles in rad: numbers with a unit, or sexagesimal.
 
         ``hours``: sexagesimal ones without marks or unit are hours, as of right ascensions.

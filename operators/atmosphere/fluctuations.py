@@ -20,7 +20,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.numerics.smooth import (
     PAD,
@@ -327,7 +326,7 @@ def _unit_size(n_detectors: int, step: int, streams: int) -> int:
     )
 
 
-def _sums(y: NDArray[np.float64]) -> tuple[int, float, float]:
+def _sums(y: Floats) -> tuple[int, float, float]:
     return y.size, float(y.sum()), float(np.einsum("ij,ij->", y, y))
 
 

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 from .fluctuations import units_fit
 from .turbulence.geometry import ScanPlane, axes, axes_at, crossing, looking, rays
@@ -313,7 +312,7 @@ class _Path:
         self.elevation = np.arcsin(self._rays(self._picked)[2])
         self._errors: dict[int, tuple[Floats, float]] = {}
 
-    def _rays(self, index: NDArray[np.int64] | slice) -> Floats:
+    def _rays(self, index: Integers | slice) -> Floats:
         return rays(axes(self._observation.boresight_azel[index]), self._xi, self._eta)
 
     def velocity(self, plane: ScanPlane) -> Floats:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.canvas import Sketch, shown_axes
@@ -29,7 +28,7 @@ from zonda.core.output import Output, Progress
 from zonda.core.storage.files import atomic_path, product_path
 from zonda.core.storage.fits_files import header_of, write_image
 from zonda.core.storage.table_files import Column, write_ecsv
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 from .model import AtmosphereModel, ExpectedLoad
 from .realization import drifting_layers, height_of_vapour
@@ -294,7 +293,7 @@ def screens(model: AtmosphereModel, moment: float | None, moments: int, pixels: 
     )
 
 
-def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: NDArray[np.int64]) -> Floats:
+def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: Integers) -> Floats:
     """(n, k) fluctuation of the PWV [m] along lines of sight at focal-plane offsets (n,) and
     samples (k,), equation (1).
 

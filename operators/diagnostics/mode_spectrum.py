@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
@@ -34,7 +33,7 @@ from zonda.core.data import Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.stream import Stream, forget_pages
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Integers
 
 from .series import Modes, StreamDiagnostic, spread_evenly
 
@@ -62,7 +61,7 @@ class Components:
     energy: float
     vectors: Floats
     times: Floats
-    used: NDArray[np.bool_]
+    used: Bools
 
 
 class Lagged:
@@ -70,7 +69,7 @@ class Lagged:
     samples.
     """
 
-    def __init__(self, stream: Stream, detectors: NDArray[np.int64], delays: int, lag: int) -> None:
+    def __init__(self, stream: Stream, detectors: Integers, delays: int, lag: int) -> None:
         self.stream, self.detectors, self.delays, self.lag = stream, detectors, delays, lag
         self.n_rows, self.n_samples = (
             detectors.size * (delays + 1),

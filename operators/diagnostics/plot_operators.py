@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.canvas import DPI, Sketch, file_of, unit_of
@@ -42,7 +41,7 @@ from zonda.core.maps.units import MapOutput, parse_unit
 from zonda.core.numerics.sphere import angle_text, sides_text
 from zonda.core.output import output_folder
 from zonda.core.storage.files import atomic_path, product_path
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Bools, Floats
 
 from .comparison.files import plane_of
 from .comparison.statistics import Comparison
@@ -86,7 +85,7 @@ class Flat:
 
     planes: dict[str, AnyFloats]
     hits: AnyFloats
-    covered: NDArray[np.bool_]
+    covered: Bools
     wcs: Any
 
     @classmethod

@@ -16,7 +16,7 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.flags import has_a_signal
 from zonda.core.signal import BUILT_IN, MAIN, TRANSMISSION, Component
 from zonda.core.stream import StreamName
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 from .series import Spectrum, StreamDiagnostic, count_flagged, no_stream, spread_evenly
 
@@ -94,7 +94,7 @@ class Chosen:
     ``welch``: None where the scan is too short.
     """
 
-    detectors: NDArray[np.int64]
+    detectors: Integers
     welch: Welch | None
     found: dict[int, Any] = field(default_factory=dict)
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.data import Block, Data, Observation
@@ -23,7 +22,7 @@ from zonda.core.signal import is_stream
 from zonda.core.storage.table_files import Column
 from zonda.core.stream import StreamName, streams_asked, streams_needed
 from zonda.core.tables import html_table
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 
 class StreamDiagnostic(Operator):
@@ -286,7 +285,7 @@ def key_of(operator: Operator, usual: str) -> str:
     return operator.name or (operator.label if own else usual)
 
 
-def spread_evenly(observation: Observation, most: int) -> NDArray[np.int64]:
+def spread_evenly(observation: Observation, most: int) -> Integers:
     """At most ``most`` detectors, chosen evenly among those not flagged."""
     usable = np.flatnonzero(observation.good_detectors)
     ends = np.linspace(0, max(0, usable.size - 1), min(usable.size, most))

@@ -24,11 +24,10 @@ from dataclasses import dataclass
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
 from zonda.core.numerics.smooth import spline_basis
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 from .rows import AT_ONCE, Mask, Rows, read, write
 
@@ -41,7 +40,7 @@ diagonals.
 """
 
 
-Bins = tuple[NDArray[np.int64], NDArray[np.int64]]
+Bins = tuple[Integers, Integers]
 """End of each run of samples in one bin (`runs`), and its bin."""
 NO_BINS: Bins = np.empty(0, np.int64), np.empty(0, np.int64)
 
@@ -64,12 +63,12 @@ class Basis:
     """
 
     functions: Floats
-    stops: NDArray[np.int64]
-    firsts: NDArray[np.int64]
+    stops: Integers
+    firsts: Integers
     size: int
 
     @classmethod
-    def of(cls, functions: Floats, first: NDArray[np.int64], size: int) -> Basis:
+    def of(cls, functions: Floats, first: Integers, size: int) -> Basis:
         """From the number (N,) of the first function that reaches each sample."""
         stops = runs(first)
         return cls(np.ascontiguousarray(functions), stops, first[stops - 1], size)
@@ -121,7 +120,7 @@ class Basis:
         _subtract(*rows, *arrays, coefficients, means)
 
 
-def runs(value: NDArray[np.int64]) -> NDArray[np.int64]:
+def runs(value: Integers) -> Integers:
     """Ends of runs of `AT_ONCE` samples or less, each within one chunk, whose ``value`` (N,) is the
     same.
     """

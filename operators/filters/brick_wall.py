@@ -25,13 +25,12 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dct, next_fast_len
 
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS, chunks, empty
 from zonda.core.numerics.smooth import product, spline_basis
-from zonda.core.types import AnyFloats
+from zonda.core.types import AnyFloats, Indices, Integers
 
 SHORTEST_STEP = 8
 """Samples per coarse knot below which the full DCT is cheaper and is used instead."""
@@ -81,7 +80,7 @@ class HighpassPlan:
     n: int
     cut: int
     knots: int
-    first: NDArray[np.int64]
+    first: Integers
     taps: int
     modes: AnyFloats
     spread_modes: AnyFloats
@@ -91,7 +90,7 @@ class HighpassPlan:
     _weights: dict[np.dtype[Any], AnyFloats] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
-    def apply(self, rows: AnyFloats, bad: NDArray[np.intp] = NONE) -> int:
+    def apply(self, rows: AnyFloats, bad: Indices = NONE) -> int:
         """Filter ``rows`` (n_det, N), C order, in place. Returns how many samples were not finite;
         they stay as they were.
 
@@ -105,7 +104,7 @@ class HighpassPlan:
             self._subtract(rows, self._low(coarse))
         return sum(self._bridged(rows[d], bad) for d in np.flatnonzero(~done))
 
-    def _bridged(self, row: AnyFloats, bad: NDArray[np.intp]) -> int:
+    def _bridged(self, row: AnyFloats, bad: Indices) -> int:
         """`apply` to one row (N,) that has gaps or no coarse series."""
         lost = np.flatnonzero(~np.isfinite(row))
         gaps = np.union1d(bad, lost)
@@ -289,7 +288,7 @@ def _sums(
     return tuple(found)
 
 
-def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], AnyFloats]:
+def _around(samples: slice, n: int, knots: int) -> tuple[Integers, AnyFloats]:
     """Each sample's interval (m,), counted from the first knot, and B at the four knots around it
     (4, m).
     """
@@ -298,7 +297,7 @@ def _around(samples: slice, n: int, knots: int) -> tuple[NDArray[np.int64], AnyF
     return cell, spline_basis(position - cell)
 
 
-def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
+def _groups(n: int, knots: int) -> tuple[Integers, int]:
     """`HighpassPlan.first` and ``taps``."""
     begin = np.arange(0, n, GROUP)
     first, last = (
@@ -311,7 +310,7 @@ def _groups(n: int, knots: int) -> tuple[NDArray[np.int64], int]:
 def _weights(
     n: int,
     knots: int,
-    first: NDArray[np.int64],
+    first: Integers,
     taps: int,
     kind: np.dtype[Any],
 ) -> AnyFloats:
@@ -330,7 +329,7 @@ def _weights(
     return found
 
 
-def bridge(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
+def bridge(row: AnyFloats, gaps: Indices) -> None:
     """Replace the samples ``gaps`` by straight lines between their good neighbours (held constant
     at the ends).
     """
@@ -340,7 +339,7 @@ def bridge(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
     row[gaps] = np.interp(gaps, known, row[known])
 
 
-def bridge_adjoint(row: AnyFloats, gaps: NDArray[np.intp]) -> None:
+def bridge_adjoint(row: AnyFloats, gaps: Indices) -> None:
     """Transpose of `bridge`: the samples ``gaps`` are shared out to their good neighbours."""
     known = np.delete(np.arange(row.size), gaps)
     behind = np.searchsorted(known, gaps)

@@ -41,13 +41,13 @@ from zonda.core.flags import DEAD
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.signal import MAIN
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 from .gram import NOTHING, Gram, Ritz, Usable, lanczos
 from .rows import LinearFilter
 from .source_mask import MASKED, Inside, SourceMask, counts
 
-Mask = NDArray[np.bool_]
+Mask = Bools
 
 
 @dataclass

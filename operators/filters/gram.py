@@ -23,7 +23,7 @@ from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks, empty
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.stream import Stream, columns
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Indices
 
 from .source_mask import Inside
 
@@ -196,7 +196,7 @@ class Usable:
         (n_det,): by which rows are divided before modes are sought; None: by nothing.
     """
 
-    def __init__(self, use: NDArray[np.bool_], n_used: int) -> None:
+    def __init__(self, use: Bools, n_used: int) -> None:
         self.use, self.n_used, self.energy = use, n_used, 0.0
         self.scale: Floats | None = None
         self.not_finite = self.constant = np.zeros(use.size, bool)
@@ -243,7 +243,7 @@ class Gram(Usable):
         self,
         stream: Stream,
         pool: ThreadPoolExecutor,
-        use: NDArray[np.bool_] | None = None,
+        use: Bools | None = None,
         noiseless: bool = False,
         inside: Inside | None = None,
         unit_rms: bool = False,
@@ -327,7 +327,7 @@ class Gram(Usable):
     def _pass(
         self,
         q: Floats,
-        rows: NDArray[np.intp],
+        rows: Indices,
         moments: bool = False,
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """(A 1, squares, G q, A^T q), the first two (n_det,) only where wanted: one reading of the
@@ -420,7 +420,7 @@ def tile_length(n_detectors: int, itemsize: int) -> int:
     return length
 
 
-def near_the_mean(use: NDArray[np.bool_]) -> Floats:
+def near_the_mean(use: Bools) -> Floats:
     """A unit vector (n_det,) close to the mean that no mode is orthogonal to."""
     start = use * (1.0 + 0.01 * directions(0, use.size))
     return np.asarray(start / max(float(np.sqrt(start @ start)), 1e-300), np.float64)

@@ -28,14 +28,13 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle
 from zonda.core.flags import has_a_signal
 from zonda.core.observation import Observation
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 from .baseline import Basis, Bins, Fit, polynomials, runs, solved
 from .rows import LinearFilter, Mask, Removal, Rows
@@ -80,7 +79,7 @@ class GroundFilter(LinearFilter):
         return Template.of(number, trend, has_a_signal(observation.flags)), None
 
 
-def _bins(observation: Observation, width: float, split: bool) -> NDArray[np.int64]:
+def _bins(observation: Observation, width: float, split: bool) -> Integers:
     """(n,) bin of each sample, from 0; bins that are nowhere are not counted."""
     azimuth = (
         observation.azimuth
@@ -118,7 +117,7 @@ class Template:
         The fit of T'.
     """
 
-    bins: NDArray[np.int64]
+    bins: Integers
     raw: Floats
     use: Mask
     runs: Bins
@@ -126,7 +125,7 @@ class Template:
     trend: Fit
 
     @classmethod
-    def of(cls, bins: NDArray[np.int64], raw: Floats, use: Mask) -> Template:
+    def of(cls, bins: Integers, raw: Floats, use: Mask) -> Template:
         """For the samples ``use`` (n,)."""
         count = np.bincount(bins[use], minlength=int(bins.max()) + 1)
         share = np.divide(1.0, count, where=count > 0, out=np.zeros(len(count)))

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from zonda.core.configuration.parameters import quantity
@@ -23,7 +22,7 @@ from zonda.core.configuration.units import Hertz, Seconds
 from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import TRIMMED, has_a_signal
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 
 from .baseline import Fit, polynomials
 from .brick_wall import HighpassPlan, first_kept, plan_highpass
@@ -176,7 +175,7 @@ class Bridged:
     """
 
     act: Callable[[AnyFloats], object]
-    bad: NDArray[np.intp]
+    bad: Indices
     trend: Fit | None = None
     plan: HighpassPlan | None = None
     """The brick wall, which without a mask acts on rows of any precision."""

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
@@ -26,7 +25,7 @@ from zonda.core.data import Data, Observation
 from zonda.core.errors import PipelineError
 from zonda.core.flags import TRIMMED, has_a_signal, slices_in
 from zonda.core.numerics.smooth import product
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 from .baseline import Basis, Fit, polynomials, splines
 from .rows import LinearFilter, Removal, Rows
@@ -174,10 +173,10 @@ class Pieces:
     parts: list[slice]
     fits: list[Fit]
     gaps: list[tuple[int, slice, Basis]]
-    outside: NDArray[np.bool_]
+    outside: Bools
 
     @classmethod
-    def of(cls, parts: list[slice], order: int, use: NDArray[np.bool_]) -> Pieces:
+    def of(cls, parts: list[slice], order: int, use: Bools) -> Pieces:
         """Polynomials up to ``order`` fitted to the samples ``use`` (n,) of each part; a part
         begins behind the one before.
         """
@@ -193,7 +192,7 @@ class Pieces:
         ]
         return cls(parts, fits, gaps, outside)
 
-    def remove(self, rows: Rows, masked: NDArray[np.bool_] | None = None) -> int:
+    def remove(self, rows: Rows, masked: Bools | None = None) -> int:
         """Equation (1) on rows in place; the rest as of `Fit.remove`."""
         spoilt, removed = 0, list[Floats]()
         for part, fit in zip(self.parts, self.fits, strict=True):
@@ -214,7 +213,7 @@ class Pieces:
             lines.subtract(rows.at(gap.start), np.stack(line, axis=1))
         return spoilt
 
-    def adjoint(self, rows: Rows, masked: NDArray[np.bool_] | None = None) -> None:
+    def adjoint(self, rows: Rows, masked: Bools | None = None) -> None:
         """Transpose of `remove` on float64 rows in place: lines of gaps act on the polynomials'
         values at the ends of the intervals beside them.
         """

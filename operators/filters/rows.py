@@ -11,14 +11,13 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Block, Data, Observation
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Bools, Floats
 
 from .source_mask import MASKED, Inside, SourceMask
 
@@ -33,7 +32,7 @@ stay in the last cache.
 AT_ONCE = 512
 """Samples of a chunk: what all rows share of them stays in the first cache."""
 
-Mask = NDArray[np.bool_]
+Mask = Bools
 
 
 class Rows(NamedTuple):

@@ -21,7 +21,6 @@ from typing import Protocol
 
 import numpy as np
 from astropy.wcs import WCS
-from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from zonda.core.configuration.input_paths import InputPath
@@ -35,7 +34,7 @@ from zonda.core.numerics.projection import pixel_matrix, ray_coefficients, rotat
 from zonda.core.observation import Observation
 from zonda.core.storage.files import reading
 from zonda.core.storage.fits_files import check_size, opened
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Bools, Floats, Indices
 
 from .brick_wall import bridge, bridge_adjoint
 
@@ -155,7 +154,7 @@ class SourceMask(Parameters):
 class Inside(Protocol):
     """Samples of a scan in a mask."""
 
-    def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
+    def at(self, detectors: slice, samples: slice) -> Bools:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
 
 
@@ -177,7 +176,7 @@ class InsideDisc:
     rays: Floats
     half_chord: float
 
-    def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
+    def at(self, detectors: slice, samples: slice) -> Bools:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
         a, b = self.rays[:, detectors], self.centre[:, samples]
         found = np.zeros((a.shape[1], b.shape[1]))
@@ -197,8 +196,8 @@ def counts(inside: Inside, n_detectors: int, n_samples: int) -> tuple[int, int]:
 
 def filter_outside(
     row: AnyFloats,
-    bad: NDArray[np.intp],
-    inside: NDArray[np.bool_] | None,
+    bad: Indices,
+    inside: Bools | None,
     act: Callable[[AnyFloats], object],
 ) -> int:
     """Equation (1) on one detector's scan ``row`` (N,) in place; ``act`` is F, in place.
@@ -223,8 +222,8 @@ def filter_outside(
 
 def adjoint_outside(
     row: AnyFloats,
-    bad: NDArray[np.intp],
-    inside: NDArray[np.bool_] | None,
+    bad: Indices,
+    inside: Bools | None,
     act: Callable[[AnyFloats], object],
 ) -> None:
     """Transpose of `filter_outside` on a float64 row in place; ``act`` is F^T."""
@@ -238,9 +237,7 @@ def adjoint_outside(
     row[masked] += before
 
 
-def _bridged(
-    gaps: NDArray[np.intp], inside: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _bridged(gaps: Indices, inside: Bools | None) -> tuple[Indices, Indices]:
     """Samples in the mask, and those that are bridged; no mask where it leaves nothing."""
     masked = np.zeros(0, np.intp) if inside is None else np.flatnonzero(inside)
     every = np.union1d(gaps, masked)
@@ -264,9 +261,9 @@ class InsideImage:
     h: Floats
     xi: Floats
     eta: Floats
-    masked: NDArray[np.bool_]
+    masked: Bools
 
-    def at(self, detectors: slice, samples: slice) -> NDArray[np.bool_]:
+    def at(self, detectors: slice, samples: slice) -> Bools:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
         xi, eta, h = self.xi[detectors, None], self.eta[detectors, None], self.h[:, samples]
         x, y, w = (h[k] * xi + h[k + 1] * eta + h[k + 2] for k in (0, 3, 6))
@@ -280,7 +277,7 @@ class InsideImage:
 
 
 @lru_cache(4)
-def _read(path: Path, changed: int) -> tuple[NDArray[np.bool_], Floats]:
+def _read(path: Path, changed: int) -> tuple[Bools, Floats]:
     """Masked pixels (ny, nx) of the first image of a FITS file, and the matrix (3, 3) from
     directions on the sky to its pixels (`projection.pixel_matrix`).
 

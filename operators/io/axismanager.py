@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import factor_to
@@ -30,7 +29,7 @@ from zonda.core.flags import (
 )
 from zonda.core.numerics.quaternions import detector_quaternions, from_angles, multiply
 from zonda.core.storage.hdf5_files import check_size
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Indices, Integers
 
 from . import toast_hdf5
 from .time_ordered_data import TimeOrderedData
@@ -101,10 +100,10 @@ class Flag:
         (n_samp,) samples of all detectors, which the flags of samples have.
     """
 
-    spans: NDArray[np.int64]
-    ends: NDArray[np.int64] | None
+    spans: Integers
+    ends: Integers | None
     bit: int = INVALID
-    common: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    common: Bools = field(default_factory=lambda: np.zeros(0, bool))
 
 
 class Reader(toast_hdf5.Reader):
@@ -176,7 +175,7 @@ class Reader(toast_hdf5.Reader):
                 found[name] = str(self._aman.units.get(name, ""))
         return found
 
-    def flags(self, detectors: NDArray[np.intp], samples: slice) -> Flags | None:
+    def flags(self, detectors: Indices, samples: slice) -> Flags | None:
         """(n, m) uint8, flags of samples of each detector but for those of all; None: there are
         none.
         """

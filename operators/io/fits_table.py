@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.maps.map_file import ascii_text
 from zonda.core.storage.files import UNPACKED_MAX, is_packed, unpacked, writing
 from zonda.core.storage.fits_files import check_size, opened, table_bytes
 from zonda.core.stream import UNITS
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 from zonda.core.weather import GroundWeather
 
 from .time_ordered_data import OF_DETECTORS, TimeOrderedData, TodWriter
@@ -231,7 +230,7 @@ class Reader:
             text = "is compressed: its streams cannot be read in parts"
             raise InputError(text, place=self.place, cure="unpack it first")
 
-    def read(self, stream: str, detectors: NDArray[np.intp], samples: slice) -> AnyFloats:
+    def read(self, stream: str, detectors: Indices, samples: slice) -> AnyFloats:
         """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and
         type.
         """
@@ -245,7 +244,7 @@ class Reader:
                 raise InputError("is truncated", place=self.place, cure=CURE)
         return found.astype(kind.newbyteorder("="))
 
-    def flags(self, detectors: NDArray[np.intp], samples: slice) -> None:
+    def flags(self, detectors: Indices, samples: slice) -> None:
         """The file has no flags of single samples of detectors."""
 
     def noise(self, model: str | None, mask: int) -> dict[str, Floats]:

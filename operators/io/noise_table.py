@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core import flags
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import TILE_DETECTORS, chunks
 from zonda.core.storage.table_files import Column, write_ecsv
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 from .recorded_scan import rows_of_bands
 from .recorded_stream import AT_ONCE, RecordedStream
@@ -37,7 +36,7 @@ COLUMNS = {
 }
 """Of the table, beside the names and positions of the detectors."""
 
-Estimate = Callable[[Floats, NDArray[np.bool_], float], Any]
+Estimate = Callable[[Floats, Bools, float], Any]
 """From samples [K], which of them may be used, and their rate [Hz], an object with `COLUMNS`; None:
 there is no estimate.
 """

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Discriminator, Field, PrivateAttr, Tag, field_serializer, field_validator
 
 from zonda.core import flags
@@ -24,7 +23,7 @@ from zonda.core.flags import Intervals, intervals_of
 from zonda.core.instrument import Instrument
 from zonda.core.observation import Observation
 from zonda.core.operator import Operator
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Indices
 from zonda.core.weather import GroundWeather
 
 from .recorded_scan import (
@@ -56,7 +55,7 @@ class RecordedBand:
     path: Path
     tod: TimeOrderedData
     camera: RecordedInstrument
-    rows: NDArray[np.intp]
+    rows: Indices
     noise: str
 
 
@@ -285,7 +284,7 @@ class RecordedFiles(Operator):
         self,
         tod: TimeOrderedData,
         path: Path,
-        rows: NDArray[np.intp],
+        rows: Indices,
     ) -> tuple[dict[str, Floats], str]:
         """Columns with the noise of the table, for the detectors ``rows``, of a model of the file
         or the file's own, and which of these it is in words.

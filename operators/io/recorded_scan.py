@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
 from zonda.core.errors import InputError, ZondaError
@@ -18,7 +17,7 @@ from zonda.core.instrument import Band, CameraBand, Instrument, Telescope
 from zonda.core.registry import sites
 from zonda.core.scene import HIGHER, NEAR, distance
 from zonda.core.site import Site
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Indices
 
 from .time_ordered_data import TimeOrderedData
 
@@ -121,7 +120,7 @@ def site_of(tod: TimeOrderedData) -> Site:
     return Site(**given)
 
 
-def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[NDArray[np.intp]]:
+def rows_of_bands(tod: TimeOrderedData, band: float | None, place: str) -> list[Indices]:
     """Rows of the detectors of each band, in the order of their centres; ``band``: centre [Hz] of
     the only one that is used.
 
@@ -225,8 +224,8 @@ def band_of(
 
 def instrument_of(
     tod: TimeOrderedData,
-    rows: NDArray[np.intp],
-    used: NDArray[np.bool_],
+    rows: Indices,
+    used: Bools,
     given: Instrument | None,
     place: str,
 ) -> RecordedInstrument:
@@ -271,7 +270,7 @@ def instrument_of(
     return made
 
 
-def _known(name: str, values: Floats, used: NDArray[np.bool_]) -> Floats:
+def _known(name: str, values: Floats, used: Bools) -> Floats:
     """The values (n_det,), and the median of the used detectors' where one that is not ``used`` has
     none that can be.
     """
@@ -334,7 +333,7 @@ def _band(
 def _focalplane(
     tod: TimeOrderedData,
     columns: Mapping[str, Floats],
-    rows: NDArray[np.intp],
+    rows: Indices,
     given: Instrument | None,
     place: str,
 ) -> Focalplane:

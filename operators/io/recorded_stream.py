@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.band import Band
 from zonda.core.configuration.units import factor_to
@@ -14,7 +13,7 @@ from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.numerics.smooth import SmoothField
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Bools, Floats, Indices
 
 AT_ONCE = 4 * TILE_SAMPLES
 """Samples of `TILE_DETECTORS` detectors that are read at once."""
@@ -60,10 +59,10 @@ class RecordedStream:
 
     file: Any
     name: str
-    rows: NDArray[np.intp]
+    rows: Indices
     mask: np.uint8
-    good: NDArray[np.bool_] | None = None
-    usable: NDArray[np.bool_] | None = None
+    good: Bools | None = None
+    usable: Bools | None = None
     unit: str | None = None
     band: Band | None = None
     level: Floats = field(default_factory=lambda: np.zeros(0))
@@ -131,7 +130,7 @@ class RecordedStream:
             np.count_nonzero(bad[(self.file.tod.detector_flags[rows] & self.mask) == 0])
         )
 
-    def _refuse_damage(self, values: Floats, rows: NDArray[np.intp], samples: slice) -> None:
+    def _refuse_damage(self, values: Floats, rows: Indices, samples: slice) -> None:
         """InputError for the first sample that is used and cannot be a temperature."""
         used = (self.file.tod.detector_flags[rows] & self.mask) == 0
         large = (

@@ -30,7 +30,7 @@ from zonda.core.flags import (
 from zonda.core.numerics.quaternions import detector_quaternions, directions
 from zonda.core.numerics.sphere import angles
 from zonda.core.storage.files import writing
-from zonda.core.types import AnyFloats
+from zonda.core.types import AnyFloats, Floats
 from zonda.core.weather import GroundWeather
 
 LIMITS = {
@@ -72,7 +72,7 @@ OF_DETECTORS = (
 """Columns of the detectors in a file."""
 
 
-def _none() -> NDArray[np.float64]:
+def _none() -> Floats:
     return np.zeros((0, 4))
 
 
@@ -132,26 +132,26 @@ class TimeOrderedData:
 
     name: str
     start: str
-    seconds: NDArray[np.float64]
-    times: NDArray[np.float64]
+    seconds: Floats
+    times: Floats
     sample_rate: float
     telescope: str
     field_of_view: float
     site: tuple[str, float, float, float]
-    boresight_azel: NDArray[np.float64] = field(default_factory=_none)
-    boresight_radec: NDArray[np.float64] = field(default_factory=_none)
+    boresight_azel: Floats = field(default_factory=_none)
+    boresight_radec: Floats = field(default_factory=_none)
     flags: NDArray[np.uint8]
     detector_flags: NDArray[np.uint8]
     names: list[str]
-    quats: NDArray[np.float64]
-    columns: dict[str, NDArray[np.float64]]
+    quats: Floats
+    columns: dict[str, Floats]
     streams: dict[str, AnyFloats] = field(default_factory=dict)
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
-    hwp_angle: NDArray[np.float64] | None = None
-    azimuth: NDArray[np.float64] | None = None
+    hwp_angle: Floats | None = None
+    azimuth: Floats | None = None
     metadata: dict[str, str | int | float] = field(default_factory=dict)
-    offsets: NDArray[np.float64] | None = None
+    offsets: Floats | None = None
 
     @property
     def n_samples(self) -> int:
@@ -272,7 +272,7 @@ class TimeOrderedData:
         return {name: spans for name, spans in self.intervals.items() if name != TRIMMED_INTERVALS}
 
     @property
-    def xi(self) -> NDArray[np.float64]:
+    def xi(self) -> Floats:
         """(n_det,) offset towards increasing azimuth: a tangent, on the gnomonic plane about the
         boresight.
 
@@ -282,11 +282,11 @@ class TimeOrderedData:
         return self._offsets()[:, 0]
 
     @property
-    def eta(self) -> NDArray[np.float64]:
+    def eta(self) -> Floats:
         """(n_det,) offset towards increasing elevation, as `xi`."""
         return self._offsets()[:, 1]
 
-    def _offsets(self) -> NDArray[np.float64]:
+    def _offsets(self) -> Floats:
         if self.offsets is not None:
             return self.offsets
         x, y, z = directions(self.quats).T
@@ -294,7 +294,7 @@ class TimeOrderedData:
 
     def xieta_sotodlib(
         self,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[Floats, Floats, Floats]:
         """xi, eta, gamma (n_det,) [rad] as sotodlib and so3g define them: sines, of the same signs
         as ours; gamma is the angle of the polarization from increasing eta towards increasing xi.
         """

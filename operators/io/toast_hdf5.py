@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Unit
@@ -26,7 +25,7 @@ from zonda.core.flags import INVALID, Flags
 from zonda.core.storage.files import reading, writing
 from zonda.core.storage.hdf5_files import Disk, check_size, checked, read_columns
 from zonda.core.stream import UNITS
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 from zonda.core.weather import GroundWeather
 
 from .time_ordered_data import OF_SAMPLES, TimeOrderedData, TodWriter
@@ -350,7 +349,7 @@ class Reader:
         _check_parts(self._file, self.place)
         return _read(self._file, self.place), self._file["detdata"]
 
-    def read(self, stream: str, detectors: NDArray[np.intp], samples: slice) -> AnyFloats:
+    def read(self, stream: str, detectors: Indices, samples: slice) -> AnyFloats:
         """(n, m) values of a stream: rows ``detectors`` (n,) of the file, in its own units and
         type.
         """
@@ -358,7 +357,7 @@ class Reader:
             found: AnyFloats = _rectangle(self._data[stream], detectors, samples)
             return found
 
-    def flags(self, detectors: NDArray[np.intp], samples: slice) -> Flags | None:
+    def flags(self, detectors: Indices, samples: slice) -> Flags | None:
         """(n, m) uint8, flags of each sample of each detector; None: the file has none."""
         found = self._data.get("flags")
         if found is None:
@@ -437,7 +436,7 @@ def _check_parts(file: Any, place: str) -> None:
         raise KeyError("there is no pointing (shared/boresight_azel, shared/boresight_radec)")
 
 
-def _rectangle(item: Any, rows: NDArray[np.intp], samples: slice) -> Any:
+def _rectangle(item: Any, rows: Indices, samples: slice) -> Any:
     """Rows and samples of a data set, or of a group that holds a FLAC-compressed one."""
     import h5py
 
@@ -522,7 +521,7 @@ def _in_seconds(spans: Any, times: AnyFloats, seconds: AnyFloats) -> list[tuple[
     return list(zip(start.tolist(), stop.tolist(), strict=True))
 
 
-def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
+def columns_of(table: Any, rows: Indices) -> dict[str, Floats]:
     """`TimeOrderedData.columns` of these rows of TOAST's table of detectors."""
     import astropy.units as u
 
@@ -542,14 +541,14 @@ def columns_of(table: Any, rows: NDArray[np.intp]) -> dict[str, Floats]:
     return columns
 
 
-def offsets_of(table: Any, rows: NDArray[np.intp]) -> Floats | None:
+def offsets_of(table: Any, rows: Indices) -> Floats | None:
     """`TimeOrderedData.offsets` of these rows of TOAST's table of detectors."""
     return (
         np.array([table[k][rows] for k in OFFSETS]).T if {*OFFSETS} <= set(table.colnames) else None
     )
 
 
-def _focalplane(instrument: Any, names: list[str], place: str) -> tuple[Any, NDArray[np.intp]]:
+def _focalplane(instrument: Any, names: list[str], place: str) -> tuple[Any, Indices]:
     """The table of detectors, and the rows of those that have data."""
     table = read_columns(instrument, "focalplane", place)
     every = [str(name) for name in np.asarray(table["name"]).astype(str)]

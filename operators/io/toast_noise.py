@@ -8,12 +8,11 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.units import factor_to
 from zonda.core.errors import InputError
 from zonda.core.storage.hdf5_files import check_size
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 DEFAULT_MODEL = "noise_model"
 """Name of the noise model that TOAST's operators make and read where no other is asked for."""
@@ -38,7 +37,7 @@ def models(file: Any) -> list[str]:
 def columns_of_model(
     group: Any,
     detectors: list[str],
-    unused: NDArray[np.bool_],
+    unused: Bools,
     place: str,
 ) -> dict[str, Floats]:
     """NET [K sqrt(s)], knee, minimum_frequency [Hz] and slope (n_det,) of the spectra of an open

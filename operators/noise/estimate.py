@@ -30,10 +30,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Indices
 
 SEGMENTS = 24
 """Windows without overlap that a scan is cut into, where the length of a segment is not given."""
@@ -110,7 +109,7 @@ def median_bias(segments: int) -> float:
 
 def spectrum(
     row: Floats,
-    good: NDArray[np.bool_],
+    good: Bools,
     rate: float,
     length: int,
 ) -> tuple[Floats, Floats, int]:
@@ -222,7 +221,7 @@ def _mixed(frequency: Floats, step: float) -> tuple[Floats, Floats]:
 class _Bins:
     """Logarithmic bins of frequencies: where each begins, and how many are in it."""
 
-    first: NDArray[np.intp]
+    first: Indices
     number: Floats
 
     @classmethod

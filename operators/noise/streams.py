@@ -16,7 +16,7 @@ from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS
 from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, normal_tile, normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
-from zonda.core.types import AnyFloats
+from zonda.core.types import AnyFloats, Floats
 
 from .one_over_f import PowerLawFilter
 
@@ -158,7 +158,7 @@ class StreamsOfSlopes:
         By slope.
     """
 
-    def __init__(self, slopes: NDArray[np.float64], made: Mapping[float, Streams]) -> None:
+    def __init__(self, slopes: Floats, made: Mapping[float, Streams]) -> None:
         self._slopes, self._made = slopes, made
         self.variance = np.array([made[slope].variance for slope in slopes.tolist()])
 

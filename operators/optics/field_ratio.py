@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.smooth import SmoothField, interpolating, spline_basis
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Indices, Integers
 
 AT_ONCE = 4096
 """Detectors whose series of the smooth fields are worked on at a time."""
@@ -22,7 +22,7 @@ TOLERANCE = 1e-7
 def field_ratio(
     above: SmoothField,
     below: SmoothField,
-    use: NDArray[np.intp],
+    use: Indices,
 ) -> tuple[SmoothField, float]:
     """The smooth field above / max(below, `LEAST_TRANSMISSION`), and its largest error over the
     detectors ``use``.
@@ -65,7 +65,7 @@ def field_ratio(
         step //= 2
 
 
-def _representatives(weights: NDArray[np.floating], use: NDArray[np.intp]) -> NDArray[np.intp]:
+def _representatives(weights: NDArray[np.floating], use: Indices) -> Indices:
     """Some hundreds of more than 512 detectors: evenly chosen, those at which a node weighs most
     and least, and some in ``use``.
     """
@@ -81,7 +81,7 @@ def _representatives(weights: NDArray[np.floating], use: NDArray[np.intp]) -> ND
     )
 
 
-def _ratio(above: SmoothField, below: SmoothField, step: int, rows: NDArray[np.intp]) -> Floats:
+def _ratio(above: SmoothField, below: SmoothField, step: int, rows: Indices) -> Floats:
     """The ratio for the detectors ``rows`` at the coarse times; in the first and last column,
     its slopes at the ends.
     """
@@ -112,7 +112,7 @@ def _error(
     above: SmoothField,
     below: SmoothField,
     step: int,
-    use: NDArray[np.intp],
+    use: Indices,
 ) -> float:
     """Largest difference between ``field`` and above / below at the cells' midpoints, over the
     detectors ``use``.
@@ -148,14 +148,14 @@ def _end_slopes(field: SmoothField, step: int) -> Floats:
     return _sum(field, m, slope) * (step / field.step)
 
 
-def _cells(field: SmoothField, sample: Floats) -> tuple[NDArray[np.int64], Floats]:
+def _cells(field: SmoothField, sample: Floats) -> tuple[Integers, Floats]:
     """The cells that samples lie in, and how far into the cell they are (0 to 1)."""
     position = sample / field.step
     m = np.minimum(position.astype(np.int64), field.coefficients.shape[1] - 4)
     return m, position - m
 
 
-def _sum(field: SmoothField, m: NDArray[np.int64], weights: Floats) -> Floats:
+def _sum(field: SmoothField, m: Integers, weights: Floats) -> Floats:
     c = field.coefficients.astype(np.float64, copy=False)
     return np.asarray(sum(w * c[:, m + j] for j, w in enumerate(weights)))
 

@@ -19,11 +19,10 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.numerics.quaternions import conjugate, multiply
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 ACCURACY = 0.01
 """Error (1) aimed at, of the figure or of 0.3 of its limit, whichever is more."""
@@ -235,7 +234,7 @@ class SamplesPerBeam:
         )
 
 
-def on_the_sky(boresight: Floats, seconds: Floats, use: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def on_the_sky(boresight: Floats, seconds: Floats, use: Bools) -> tuple[Floats, Floats]:
     """Speed of the beam and rate of the field's rotation [rad/s] at up to about `POINTS` pairs of
     neighbouring samples.
 

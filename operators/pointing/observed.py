@@ -27,7 +27,7 @@ from zonda.core.operator import Operator
 from zonda.core.plots import plot_scans
 from zonda.core.scene import Scene
 from zonda.core.site import Site
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 if TYPE_CHECKING:
     from .limits import LargestMotion
@@ -186,7 +186,7 @@ def centre_of(
 def mark_turnarounds(
     label: str,
     observation: Observation,
-    turning: NDArray[np.bool_],
+    turning: Bools,
     flagged: bool,
 ) -> None:
     """Count the samples ``turning`` (n,), and flag them if that is asked for."""

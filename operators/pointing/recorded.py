@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core import flags
@@ -24,7 +23,7 @@ from zonda.core.numerics.quaternions import directions, middle
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.scene import Scene
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 from .limits import check_elevation
 from .motion import SamplesPerBeam
@@ -227,7 +226,7 @@ def _state_celestial(
     label: str,
     observation: Observation,
     computed: Floats,
-    good: NDArray[np.bool_],
+    good: Bools,
 ) -> None:
     """State which directions on the sky are used, and how far recorded ones are from those that
     follow from az and el.

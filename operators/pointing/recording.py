@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
 from zonda.core.flags import EXCLUDE_SAMPLE, NOT_RECORDED, Intervals
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Indices, Integers
 
 UNEVEN = 0.25
 """rms of the intervals between rows, over whole numbers of samples, beyond which they are no comb
@@ -172,7 +172,7 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
     return Comb(scans, counts)
 
 
-def longest_rising(values: Floats) -> NDArray[np.intp]:
+def longest_rising(values: Floats) -> Indices:
     """Indices of the longest strictly rising subsequence of ``values`` (n,); the others are out of
     order, however far.
 
@@ -197,10 +197,10 @@ def longest_rising(values: Floats) -> NDArray[np.intp]:
 
 def _scan(
     recording: Recording,
-    rows: NDArray[np.intp],
+    rows: Indices,
     seconds: Floats,
-    ahead: NDArray[np.int64],
-    good: NDArray[np.bool_],
+    ahead: Integers,
+    good: Bools,
 ) -> Scan:
     slot = np.r_[0, np.cumsum(ahead)]
     every = np.arange(slot[-1] + 1)
@@ -221,7 +221,7 @@ def _scan(
     )
 
 
-def _turned(every: NDArray[np.intp], at: NDArray[np.intp], quaternions: Floats) -> Floats:
+def _turned(every: Indices, at: Indices, quaternions: Floats) -> Floats:
     """Quaternions (n, 4) at ``every`` slot from those known ``at`` some slots: unchanged there,
     interpolated between.
     """

@@ -27,7 +27,7 @@ from zonda.core.flags import Intervals
 from zonda.core.storage import fits_files, hdf5_files
 from zonda.core.storage.files import reading
 from zonda.core.storage.table_files import Table, read_table, read_text
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 from .recording import Recording, longest_rising
 
@@ -349,7 +349,7 @@ def _check_latitude(latitude: Floats, name: str, place: str) -> None:
         )
 
 
-def _within(spans: list[tuple[float, float]], seconds: Floats) -> NDArray[np.bool_]:
+def _within(spans: list[tuple[float, float]], seconds: Floats) -> Bools:
     """(n,) which rows lie in the intervals."""
     last = np.nanmax(seconds, initial=-np.inf)
     inside = [(seconds >= a) & ((seconds < b) | (b >= last)) for a, b in spans]
@@ -360,7 +360,7 @@ def _flags(
     number: Floats,
     bits: str,
     mask: int | None,
-    trimmed: NDArray[np.bool_],
+    trimmed: Bools,
 ) -> NDArray[np.uint8]:
     """Flags in bits of `core.flags`. A value that is not a number excludes the sample."""
     whole = np.where(np.isfinite(number), number, 255).astype(np.int64)

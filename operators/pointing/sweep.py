@@ -17,10 +17,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.flags import Intervals, intervals_of
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 
 @dataclass(frozen=True)
@@ -67,11 +66,11 @@ class Sweep:
         x += self.speed * self.turnaround * beyond
         return np.where(number % 2 == 0, x, 2 * self.begin + self.width - x)
 
-    def turning(self, seconds: Floats) -> NDArray[np.bool_]:
+    def turning(self, seconds: Floats) -> Bools:
         """(n,) True in turnarounds."""
         return np.mod(seconds, self.leg + self.turnaround) > self.leg
 
-    def intervals(self, seconds: Floats, inside: NDArray[np.bool_] | bool = True) -> Intervals:
+    def intervals(self, seconds: Floats, inside: Bools | bool = True) -> Intervals:
         """TOAST's intervals of the samples ``inside`` (n,). Left to right is towards larger values;
         a turnaround has the direction of the scan before it.
 

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from zonda.core.errors import InputError
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Integers
 
 PIXELS_PER_FWHM = 4.0
 SMOOTH_BELOW = 2.0 - 1e-9
@@ -90,7 +90,7 @@ class Convolved:
     def nbytes(self) -> int:
         return sum(values.nbytes for values in self.coefficients.values())
 
-    def covered(self, mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def covered(self, mask: Bools) -> NDArray[np.uint8]:
         """A mask of the input's pixels on the grid; (0, 0) where it is."""
         if not mask.size:
             return np.zeros((0, 0), np.uint8)
@@ -235,7 +235,7 @@ def _check_size(
         )
 
 
-def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: NDArray[np.bool_]) -> Floats:
+def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: Bools) -> Floats:
     """Equation (2) at frequencies ``kx``, ``ky`` [cycles per pixel]; folded with (3) along the axes
     that are ``smooth``.
     """
@@ -258,7 +258,7 @@ def _spline_transform(k: Floats, m: int) -> Floats:
     return np.sinc(k + m) ** 4 / sum(np.sinc(k + n) ** 4 for n in FOLDS)
 
 
-def distinct(fwhm: Floats, tolerance: float = 1e-3) -> tuple[Floats, NDArray[np.int64]]:
+def distinct(fwhm: Floats, tolerance: float = 1e-3) -> tuple[Floats, Integers]:
     """Beams that serve all detectors: (values, index of each detector's value).
 
     Equal widths share one; widths that differ by less than ``tolerance`` share their mean.

@@ -18,7 +18,7 @@ from zonda.core.maps.header import exact_header
 from zonda.core.maps.image import Image
 from zonda.core.numerics.radiation import to_kelvin_rj
 from zonda.core.polarization import between_meridians, turned_by
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Bools, Floats, Integers
 
 from .beam import REACH, SIGMA, Convolved, convolve, convolve_evenly, distinct
 from .geometry import moved, placed
@@ -113,7 +113,7 @@ class Brightness:
     """
 
     planes: Floats
-    covered: NDArray[np.bool_]
+    covered: Bools
     notes: dict[str, str]
     counts: dict[str, int]
     resolution: float = 0.0
@@ -211,7 +211,7 @@ SCANS_LOOKED_AT = 8
 class ConvolvedSky(SkyInput):
     """A map of the sky that is convolved with the beams of detectors."""
 
-    def beam_widths(self, observation: Observation) -> tuple[Floats, NDArray[np.int64]]:
+    def beam_widths(self, observation: Observation) -> tuple[Floats, Integers]:
         """Distinct widths (FWHM, rad; 0: no beam) and the number of each detector's."""
         fwhm = (
             np.full(observation.n_detectors, self.fwhm)

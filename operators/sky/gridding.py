@@ -40,14 +40,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, pixel_matrix, rotation_matrices
 from zonda.core.numerics.sphere import angle_between, angles, local_axes
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 from .beam import REACH, SIGMA, SMOOTH_BELOW
 from .input_map import ImageMap, InputMap
@@ -111,10 +110,10 @@ def gridded(
     *,
     per_area: bool = False,
     outside: float = 0.0,
-    tiles: NDArray[np.bool_] | None = None,
+    tiles: Bools | None = None,
     progress: Progress = no_progress,
     axis: Floats | None = None,
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """(values, covered) of a map on the TAN grid ``target``: (k, ny, nx) K_RJ less ``outside``.
 
     Each pixel counts once: of an image that goes round the sky more than once, the first time. A
@@ -155,11 +154,11 @@ def gridded(
 def interpolated(
     source: InputMap,
     target: Any,
-    tiles: NDArray[np.bool_] | None = None,
+    tiles: Bools | None = None,
     progress: Progress = no_progress,
     per_area: bool = False,
     axis: Floats | None = None,
-) -> tuple[Floats, NDArray[np.bool_], int]:
+) -> tuple[Floats, Bools, int]:
     """(values, covered, poor) of a map on the TAN grid ``target``, (k, ny, nx), by
     `InputMap.interpolated`. Not covered is 0; ``poor`` counts points that take a mean instead.
 
@@ -186,7 +185,7 @@ def interpolated(
 def extremes(
     source: InputMap,
     target: Any,
-    tiles: NDArray[np.bool_] | None,
+    tiles: Bools | None,
     per_area: bool = False,
 ) -> tuple[float, float]:
     """Least and largest value of the map's pixels under a grid, from a thinned set of its points;
@@ -295,7 +294,7 @@ class Grid:
     wcs: Any
     shape: tuple[int, int]
     resampled: bool = False
-    tiles: NDArray[np.bool_] | None = None
+    tiles: Bools | None = None
     gridding: Gridding | None = None
 
     @property

@@ -20,7 +20,7 @@ from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import frame_rotation, some_directions, wcs_frame_rotation
 from zonda.core.numerics.sphere import angle_between, angles, local_axes
 from zonda.core.polarization import between_meridians, turned_by
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Integers
 
 from .region import MARGIN, Block, Disc
 from .sampling import NEIGHBOURS, local_fit
@@ -114,7 +114,7 @@ class InputMap:
         """Solid angles [sr] of pixels; NaN beyond the projection."""
         raise NotImplementedError
 
-    def own_centre(self, at: Pixels) -> NDArray[np.bool_]:
+    def own_centre(self, at: Pixels) -> Bools:
         """True for pixels that hold their centres: one of several that stand for the same sky."""
         raise NotImplementedError
 
@@ -122,7 +122,7 @@ class InputMap:
         """Pixels about the points of a block that the map covers, with a margin."""
         raise NotImplementedError
 
-    def under(self, block: Block) -> tuple[NDArray[np.bool_], Iterator[Pixels]]:
+    def under(self, block: Block) -> tuple[Bools, Iterator[Pixels]]:
         """The points of a block that the map covers; and, part by part, pixels among which are all
         that are nearest to points of the block. No two stand for the same sky.
         """
@@ -133,7 +133,7 @@ class InputMap:
         block: Block,
         axis: Floats | None,
         per_area: bool,
-    ) -> tuple[NDArray[np.bool_], Floats, int]:
+    ) -> tuple[Bools, Floats, int]:
         """The points of a block that the map covers; its planes (k, n) there, interpolated; and for
         how many of them a mean is taken instead.
         """
@@ -293,7 +293,7 @@ class ImageMap(InputMap):
                 found[edge] = total * CUTS**2 / there.sum(axis=(1, 2))
         return found
 
-    def own_centre(self, at: Pixels) -> NDArray[np.bool_]:
+    def own_centre(self, at: Pixels) -> Bools:
         y, x = at
         if self._period or self.grid.kind in ZENITHAL or self.wcs.has_distortion:
             return np.ones(x.shape, bool)
@@ -302,7 +302,7 @@ class ImageMap(InputMap):
         with np.errstate(invalid="ignore"):
             return (np.abs(u - x) < near) & (np.abs(v - y) < near)
 
-    def at(self, d: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    def at(self, d: Floats) -> tuple[Floats, Floats, Bools]:
         """0-based pixels (x, y) of ICRS directions (n, 3), NaN beyond the projection, and whether
         they are on the image.
         """
@@ -311,7 +311,7 @@ class ImageMap(InputMap):
         with np.errstate(invalid="ignore"):
             return x, y, (x >= -0.5) & (x < nx - 0.5) & (y >= -0.5) & (y < ny - 0.5)
 
-    def _for_splines(self, block: Block) -> tuple[NDArray[np.bool_], Floats, Floats, Pixels]:
+    def _for_splines(self, block: Block) -> tuple[Bools, Floats, Floats, Pixels]:
         """The points of a block on the image, their pixels (x, y), and rows and columns with a
         margin that splines there feel. Columns beyond a seam go on counting.
         """
@@ -328,7 +328,7 @@ class ImageMap(InputMap):
             first, last = max(first, 0), min(last, nx)
         return inside, x, y, (np.arange(int(low), int(high)), np.arange(int(first), int(last)))
 
-    def _pixels(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Pixels:
+    def _pixels(self, rows: Integers, columns: Integers) -> Pixels:
         rows, columns = np.meshgrid(rows, columns % self.shape[1], indexing="ij")
         return rows, columns
 
@@ -340,7 +340,7 @@ class ImageMap(InputMap):
         block: Block,
         axis: Floats | None,
         per_area: bool,
-    ) -> tuple[NDArray[np.bool_], Floats, int]:
+    ) -> tuple[Bools, Floats, int]:
         """See `InputMap.interpolated`: by cubic B-splines.
 
         ``per_area``: each pixel is divided by its solid angle; one beyond the projection, which has
@@ -365,7 +365,7 @@ class ImageMap(InputMap):
         ]
         return inside, np.array(found), 0
 
-    def under(self, block: Block) -> tuple[NDArray[np.bool_], Iterator[Pixels]]:
+    def under(self, block: Block) -> tuple[Bools, Iterator[Pixels]]:
         ny, nx = self.shape
         x, y, there = self.at(np.concatenate([block.d, block.rim]))
         known, there = np.isfinite(x) & np.isfinite(y), there[: len(block.d)]
@@ -431,7 +431,7 @@ class HealpixMap(InputMap):
     ``pixels`` are numbers in the ordering ``nest``; ``frame`` is an astropy frame name.
     """
 
-    pixels: NDArray[np.int64] | None
+    pixels: Integers | None
     nside: int
     nest: bool
     frame: Frame
@@ -485,16 +485,16 @@ class HealpixMap(InputMap):
 
         return np.full(len(at[0]), float(healpy.nside2pixarea(self.nside)))
 
-    def own_centre(self, at: Pixels) -> NDArray[np.bool_]:
+    def own_centre(self, at: Pixels) -> Bools:
         return np.ones(len(at[0]), bool)
 
-    def _covers(self, own: Floats) -> NDArray[np.bool_]:
+    def _covers(self, own: Floats) -> Bools:
         """True for directions (n, 3) in the map's frame whose pixels are there."""
         import healpy
 
         return self._places(healpy.vec2pix(self.nside, *own.T, nest=self.nest))[1]
 
-    def _places(self, numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _places(self, numbers: Integers) -> tuple[Integers, Bools]:
         """Indices of pixels of these numbers in ``values``, and whether they are there."""
         if self.pixels is None:
             return numbers, np.ones(len(numbers), bool)
@@ -503,7 +503,7 @@ class HealpixMap(InputMap):
         found = np.minimum(np.searchsorted(self.pixels, numbers), len(self.pixels) - 1)
         return found, self.pixels[found] == numbers
 
-    def _within(self, own: Floats, margin: float) -> NDArray[np.int64]:
+    def _within(self, own: Floats, margin: float) -> Integers:
         """Sorted numbers of the pixels about directions (n, 3) in the map's frame, ``margin`` [rad]
         beyond them.
         """
@@ -518,7 +518,7 @@ class HealpixMap(InputMap):
     def around(self, block: Block) -> Pixels:
         return (self._near(block)[1],)
 
-    def _near(self, block: Block) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    def _near(self, block: Block) -> tuple[Bools, Integers]:
         """The points of a block that are covered, and the pixels about them; more of them where few
         are covered.
         """
@@ -536,7 +536,7 @@ class HealpixMap(InputMap):
         block: Block,
         axis: Floats | None,
         per_area: bool,
-    ) -> tuple[NDArray[np.bool_], Floats, int]:
+    ) -> tuple[Bools, Floats, int]:
         """See `InputMap.interpolated`: by `local_fit`, whatever the orientation of the pixels."""
         seen, near = self._near(block)
         if not len(near):
@@ -547,7 +547,7 @@ class HealpixMap(InputMap):
         where = np.stack([block.x[seen], block.y[seen]], axis=1).astype(np.float64)
         return seen, *local_fit(points, self.planes((near[front],), axis), where)
 
-    def under(self, block: Block) -> tuple[NDArray[np.bool_], Iterator[Pixels]]:
+    def under(self, block: Block) -> tuple[Bools, Iterator[Pixels]]:
         own = block.d @ self.turn.T
         numbers = self._within(own, block.step)
         parts = (self._places(numbers[part]) for part in chunks(len(numbers), AT_ONCE))

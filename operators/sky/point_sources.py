@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.configuration.input_paths import InputPath
@@ -34,7 +33,7 @@ from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.plausibility import FLUX, doubt
 from zonda.core.storage.table_files import SERIALIZED, read_table
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 REACH = 6.0
 """Standard deviations of the beam beyond which a source is not seen."""
@@ -212,8 +211,8 @@ class Sources(NamedTuple):
     per_area: Floats
     towards: Floats
     power: Floats
-    first: NDArray[np.int64]
-    number: NDArray[np.int64]
+    first: Integers
+    number: Integers
 
     @classmethod
     def of(cls, step: PointSources, observation: Observation) -> Sources:
@@ -249,7 +248,7 @@ class Sources(NamedTuple):
         )
 
     @property
-    def in_view(self) -> NDArray[np.int64]:
+    def in_view(self) -> Integers:
         """Numbers of the sources that come near the field at any time."""
         return np.unique(self.number)
 

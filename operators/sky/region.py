@@ -10,14 +10,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.projection import boresights, pixel_matrix, tangent_wcs
 from zonda.core.numerics.sphere import local_axes
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Integers
 
 WIDEST = np.radians(60.0)
 """Largest distance from the tangent point: beyond it a gnomonic projection stretches pixels by more
@@ -63,7 +62,7 @@ class Region:
     """
 
     box: tuple[int, int, int, int]
-    tiles: NDArray[np.bool_] | None
+    tiles: Bools | None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -204,12 +203,12 @@ class Block:
         `Region.tiles` of the grid.
     """
 
-    y: NDArray[np.int64]
-    x: NDArray[np.int64]
+    y: Integers
+    x: Integers
     matrix: Floats
     step: float
     box: tuple[int, int, int, int]
-    tiles: NDArray[np.bool_] | None
+    tiles: Bools | None
 
     @cached_property
     def d(self) -> Floats:
@@ -225,7 +224,7 @@ class Block:
         y = np.concatenate([np.full(len(along), y0), np.full(len(along), y1), up, up])
         return directions_on(self.matrix, x, y)
 
-    def nearest(self, d: Floats) -> NDArray[np.bool_]:
+    def nearest(self, d: Floats) -> Bools:
         """True if ICRS directions (n, 3) are nearest to points of the block."""
         x0, x1, y0, y1 = self.box
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -239,7 +238,7 @@ class Block:
 
 def blocks(
     target: Any,
-    tiles: NDArray[np.bool_] | None,
+    tiles: Bools | None,
     progress: Progress,
     thin: int = 1,
 ) -> Iterator[Block]:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from zonda.core.kernels import kernel
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.columns import spline_of_four
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 
 CHUNK = 256
 """Samples that share a coordinate origin; divides `TILE_SAMPLES`, so chunks are absolute."""
@@ -46,7 +46,7 @@ class Chunks(NamedTuple):
     """(m, 9, CHUNK) H row by row for (xi, eta, 1); the last chunk is filled up with its last
     sample.
     """
-    box: NDArray[np.float64]
+    box: Floats
     """(m, 9, 2) least and largest of each element."""
     limits: AnyFloats
     """(m, 8) first and last place x, y of the first of a sample's 4 x 4 grid points, and the input
@@ -63,11 +63,11 @@ class Chunks(NamedTuple):
 class Rows(NamedTuple):
     """The detectors of one beam."""
 
-    numbers: NDArray[np.intp]
+    numbers: Indices
     """(n,) rows of the block's stream."""
-    xi: NDArray[np.float64]
+    xi: Floats
     """(n,) focal-plane offsets."""
-    eta: NDArray[np.float64]
+    eta: Floats
 
 
 def sample(
@@ -106,10 +106,10 @@ def sample(
 
 
 def pointing(
-    quaternions: NDArray[np.float64],
-    matrix: NDArray[np.float64],
+    quaternions: Floats,
+    matrix: Floats,
     shape: tuple[int, ...],
-    bounds: NDArray[np.float64],
+    bounds: Floats,
     kind: Any,
 ) -> Chunks:
     """Boresight on a working grid, in m chunks of `CHUNK` samples, each counted from its own

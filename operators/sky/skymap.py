@@ -11,7 +11,6 @@ from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from zonda.core.data import Block, Data, Log, Observation
@@ -20,7 +19,7 @@ from zonda.core.operator import Operator
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.product import Product
 from zonda.core.storage.fits_files import header_of
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Integers
 
 from .convolved import Beam, Brightness, ConvolvedSky
 from .gridding import Grid
@@ -72,7 +71,7 @@ class ScanSampler:
     grid: Grid
     sky: Brightness
     beams: list[Beam]
-    index: NDArray[np.int64]
+    index: Integers
     angles: PolarizationAngles | None = None
     _counts: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
     _chunks: Cache = field(default_factory=lambda: Cache(2**22))

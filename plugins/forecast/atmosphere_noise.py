@@ -24,10 +24,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 from zonda.operators.atmosphere.planning import Calibrated, calibrated
 from zonda.operators.atmosphere.turbulence.geometry import (
     ScanPlane,
@@ -107,7 +106,7 @@ class Template(NamedTuple):
         (n_scan,) sum a s F s after each scan.
     """
 
-    rows: Callable[[Track, NDArray[np.intp]], AnyFloats]
+    rows: Callable[[Track, Indices], AnyFloats]
     signal: Floats
 
 

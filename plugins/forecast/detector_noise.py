@@ -28,11 +28,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
 from zonda.core.kernels import kernel
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Bools, Floats, Indices
 
 from .survey import Noise, Survey, Track, sparse, subset
 
@@ -58,7 +57,7 @@ class Comb:
 
     origin: Floats
     spacing: float
-    inside: NDArray[np.bool_]
+    inside: Bools
 
 
 def combs(survey: Survey, radius: float, probes: int, most: int = 8) -> list[Comb]:
@@ -135,7 +134,7 @@ STEEP = 8
 FILTERED = 12
 """Scans whose series are filtered: evenly chosen of all."""
 
-Series = Callable[[Track, NDArray[np.intp]], AnyFloats]
+Series = Callable[[Track, Indices], AnyFloats]
 """(n_det, n_instant) w of detectors (numbers) along a track."""
 
 
@@ -220,7 +219,7 @@ def kernels(
     comb: Comb,
     factors: Floats,
     track: Track,
-    few: NDArray[np.intp],
+    few: Indices,
 ) -> AnyFloats:
     """(n_det, n_instant): factor times K of the nearest probe."""
     found, place = np.zeros((len(few), len(track.index)), np.float32), (comb.origin, comb.spacing)

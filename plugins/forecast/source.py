@@ -30,7 +30,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic_core import PydanticCustomError
 from scipy.ndimage import correlate1d
 
@@ -40,7 +39,7 @@ from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
 from zonda.core.numerics.projection import frame_rotation
 from zonda.core.numerics.sphere import angle_between, angle_text, angles, unit_vectors
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 from zonda.operators.maps.grid import tangent_wcs
 from zonda.operators.sky.convolved import Beam, tangent_areas
 from zonda.operators.sky.input_map import ImageMap
@@ -478,7 +477,7 @@ def _dot(a: AnyFloats, b: AnyFloats) -> float:
     return float(np.einsum("dt,dt->", a, b, dtype=np.float64))
 
 
-def series(sky: SkyMap, survey: Survey, track: Track, few: NDArray[np.intp]) -> AnyFloats:
+def series(sky: SkyMap, survey: Survey, track: Track, few: Indices) -> AnyFloats:
     """(n_det, n_instant) K_RJ that some detectors (numbers) see of a source along a track, as
     `SkyMap` samples it.
     """

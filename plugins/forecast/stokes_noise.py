@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from zonda.core.block import Block
 from zonda.core.maps.smoothing import convolved, gaussian_taps
 from zonda.core.polarization import PolarizationAngles
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 from zonda.operators.maps.binning import BandBlock, Binning, Weights, add_blocks
 from zonda.operators.maps.grid import Cells, Looking, TangentGrid
 from zonda.operators.maps.intensity_kernel import WEIGHT
@@ -171,7 +171,7 @@ class _Looks:
         self._survey, self._grid = survey, grid
         self._track: Track | None = None
 
-    def series(self, rows: NDArray[np.float32], track: Track, few: NDArray[np.intp]) -> AnyFloats:
+    def series(self, rows: NDArray[np.float32], track: Track, few: Indices) -> AnyFloats:
         """(n_det, n_instant) r times the row (n_pixels + 1, 3) of the pixel of a detector's sample;
         the last: outside.
         """

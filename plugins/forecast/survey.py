@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.assembly.signals import note_signals
 from zonda.core.configuration.loaded import PipelineFile
@@ -32,7 +31,7 @@ from zonda.core.plan.bounds import evenly
 from zonda.core.plan.pointing import observed, speeds
 from zonda.core.polarization import PolarizationAngles
 from zonda.core.scene import Scene
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Floats, Indices
 from zonda.operators.atmosphere.layers import AtmosphereLayers
 from zonda.operators.filters.brick_wall import plan_highpass
 from zonda.operators.filters.common_mode import CommonModeFilter
@@ -473,7 +472,7 @@ def sparse(number: int, most: int) -> list[int]:
     return sorted({round(k) for k in np.linspace(0, number - 1, min(most, number)).tolist()})
 
 
-def subset(every: int, number: int, seed: int = 1) -> NDArray[np.intp]:
+def subset(every: int, number: int, seed: int = 1) -> Indices:
     """At most ``number`` of the numbers below ``every``, drawn at random, in order."""
     few = np.arange(every)
     if number < every:

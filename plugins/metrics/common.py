@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Data
 from zonda.core.errors import InputError, PipelineError
@@ -17,7 +16,7 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.maps.smoothing import smoothed, smoother
 from zonda.core.numerics.sphere import FWHM_PER_SIGMA
 from zonda.core.signal import Signal, product_name, stream_of
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 COVERED = 0.1
 """Share of the 99th percentile of the hits from which a pixel counts as covered."""
@@ -80,7 +79,7 @@ def at_beam(product: MapProduct, fwhm: float | None = None) -> MapProduct:
     return product if product.smoothed_by or not width else product.smoothed(width)
 
 
-def covered(product: MapProduct) -> NDArray[np.bool_]:
+def covered(product: MapProduct) -> Bools:
     """Pixels that have a value and at least `COVERED` of the usual samples."""
     seen = product.hits[product.known]
     least = COVERED * float(np.percentile(seen, 99)) if seen.size else 1.0
@@ -106,7 +105,7 @@ def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Flo
     return np.asarray(map_coordinates(np.nan_to_num(smooth), at, order=3), np.float64)
 
 
-def extreme(values: Floats, where: NDArray[np.bool_], metric: str) -> tuple[int, float]:
+def extreme(values: Floats, where: Bools, metric: str) -> tuple[int, float]:
     """(flat index, value) of the largest absolute value; InputError about ``metric`` where there is
     none.
     """
@@ -117,7 +116,7 @@ def extreme(values: Floats, where: NDArray[np.bool_], metric: str) -> tuple[int,
     return index, float(values.flat[index])
 
 
-def relative_error_of_rms(product: MapProduct, where: NDArray[np.bool_]) -> float:
+def relative_error_of_rms(product: MapProduct, where: Bools) -> float:
     """Standard error of a weighted rms over pixels, relative, of white noise behind the smoothing
     of the map:
 

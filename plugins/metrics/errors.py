@@ -51,7 +51,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.accuracy.metrics import Metric, OfParts
 from zonda.core.data import Data
@@ -61,7 +60,7 @@ from zonda.core.maps.map_product import MapProduct
 from zonda.core.numerics.projection import wcs_frame_rotation
 from zonda.core.operator import Operator
 from zonda.core.signal import Signal
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 from zonda.operators.diagnostics.series import Spectrum, TimeStreams
 from zonda.operators.diagnostics.transfer_function import compare
 
@@ -305,7 +304,7 @@ def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
     return np.asarray(error / np.maximum(d, 1e-300), np.float64)
 
 
-def _mean_square(values: Floats, weights: Floats, use: NDArray[np.bool_]) -> float:
+def _mean_square(values: Floats, weights: Floats, use: Bools) -> float:
     total = float(weights[use].sum())
     return float((weights[use] * values[use] ** 2).sum() / total) if total > 0 else 0.0
 

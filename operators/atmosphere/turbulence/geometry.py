@@ -41,11 +41,10 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import PointingError
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 from ..weather.radiative_transfer import EARTH_RADIUS
 
@@ -76,7 +75,7 @@ def axes(quaternions: Floats) -> Floats:
     return np.moveaxis(np.array([[-v for v in west], north, up]), 2, 0)
 
 
-def axes_at(quaternions: Floats, index: NDArray[np.int64], step: int) -> Floats:
+def axes_at(quaternions: Floats, index: Integers, step: int) -> Floats:
     """`axes` at sample numbers ``index``, which may lie before the first or after the last sample.
     Shape (len(index), 3, 3).
 

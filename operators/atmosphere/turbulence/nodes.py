@@ -26,10 +26,9 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Integers
 
 from .beams import Aperture
 from .covariance import mixture
@@ -337,7 +336,7 @@ def layer_time_error(layer: Layer, speeds: Floats, delta: float, dt: float) -> f
     return layer.amplitude**2 * float(share)
 
 
-def times_with_margin(n_samples: int, step: int) -> NDArray[np.int64]:
+def times_with_margin(n_samples: int, step: int) -> Integers:
     """Samples at which `SmoothField.from_values` wants its values."""
     return step * np.arange(
         -PAD - SPLINE_MARGIN,

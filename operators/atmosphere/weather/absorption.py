@@ -13,11 +13,10 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.storage.files import own_data
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Indices
 
 TABLE = Path(__file__).parent.parent / "data" / "absorption.npz"
 
@@ -143,7 +142,7 @@ class AbsorptionTable:
         ratio /= np.einsum("g,glf->lf", OZONE_PARTS, ratio)
         return CrossSections(dry, water, (water_high - water) / MIXING_RATIO_HIGH, ozone, ratio)
 
-    def _bracket(self, pressure: Floats) -> tuple[NDArray[np.intp], Floats]:
+    def _bracket(self, pressure: Floats) -> tuple[Indices, Floats]:
         """Index of the table's pressure below each layer, and the weight of the one above."""
         grid, x = -np.log(self.pressure), -np.log(pressure)
         step = grid[1] - grid[0]
@@ -169,7 +168,7 @@ class AbsorptionTable:
         self,
         pressure: Floats,
         temperature: Floats,
-        row: NDArray[np.intp],
+        row: Indices,
     ) -> Floats:
         """Lagrange weights in 1/temperature on the nodes of each layer's row. (n_temperature,
         n_layer).

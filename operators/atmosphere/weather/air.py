@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from zonda.core.site import Site
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 from zonda.core.weather import Column
 
 from .radiative_transfer import (
@@ -131,7 +131,7 @@ def pressure(height: ArrayLike) -> Floats:
     )
 
 
-def impossible(column: Column) -> Iterator[tuple[NDArray[np.bool_], str]]:
+def impossible(column: Column) -> Iterator[tuple[Bools, str]]:
     """Levels (n,) that no air has, and why: a unit is another one than stated, or there is none.
 
     Weather moves a level by less than half of `OFF`.

@@ -15,11 +15,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.numerics.radiation import BOLTZMANN, T_CMB, rayleigh_jeans
-from zonda.core.types import Floats
+from zonda.core.types import Floats, Indices
 
 from .absorption import OZONE_PARTS, AbsorptionTable, CrossSections, absorption_table
 
@@ -160,7 +159,7 @@ class Layers:
         """(n,) m above the site of the middles of the layers."""
         return np.asarray((self.height[1:] + self.height[:-1]) / 2 - self.height[0])
 
-    def in_parts(self, sections: CrossSections) -> tuple[CrossSections, NDArray[np.intp], Floats]:
+    def in_parts(self, sections: CrossSections) -> tuple[CrossSections, Indices, Floats]:
         """Cross-sections with each cell that has narrow ozone lines in parts, (n, n_part); the cell
         of each part; its share.
         """

@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.maps.grid import HealpixPixels, ImagePixels, MapGrid, image_grid
@@ -38,7 +37,7 @@ from zonda.core.maps.planes import ELSEWHERE, WHITE, noise_factor
 from zonda.core.maps.smoothing import smoothed
 from zonda.core.numerics.projection import pixel_matrix
 from zonda.core.numerics.sphere import FWHM_PER_SIGMA, angle_text, angles, local_axes
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 SAME = 1e-4
 """Pixels: offsets of grids that differ from whole ones by less count as whole."""
@@ -180,7 +179,7 @@ class Plane:
                 noise = noise * _kept(x, y, self.blurred, self.grid.sides)
         return replace(self, values=values, noise=noise, spread=self.pixel**2, **there)
 
-    def independent(self, where: NDArray[np.bool_]) -> float:
+    def independent(self, where: Bools) -> float:
         """Number of independent values of the noise in the pixels ``where``, at most their number.
 
         It is their solid angle over 2 pi blurred^2, the integral of the square of the correlation,
@@ -247,7 +246,7 @@ def _sampled(values: Floats, x: Floats, y: Floats, order: int) -> Floats:
     return np.where(np.isfinite(near), map_coordinates(values, at, **edge), np.nan)
 
 
-def _whole(x: Floats, y: Floats, known: NDArray[np.bool_]) -> bool:
+def _whole(x: Floats, y: Floats, known: Bools) -> bool:
     """True if the positions that are ``known`` are whole pixels."""
     away = [np.abs(at - np.rint(at))[known].max(initial=0.0) for at in (x, y)]
     return bool(max(away) < SAME)

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 
 from zonda.core.numerics.sphere import ARCSEC
 from zonda.core.storage.table_files import Column
-from zonda.core.types import AnyFloats, Floats
+from zonda.core.types import AnyFloats, Bools, Floats
 
 DRAWS = 48
 """Draws of noise by which modes of smoothed maps are counted: their number is right to 20 %."""
@@ -62,7 +62,7 @@ def lengths(steps: float | Floats) -> Floats:
     return np.asarray(np.hypot(*cell(steps))[::-1], np.float64)
 
 
-def tapered(inside: NDArray[np.bool_], steps: float | Floats, taper: float | None = None) -> Floats:
+def tapered(inside: Bools, steps: float | Floats, taper: float | None = None) -> Floats:
     """sin^2(pi/2 min(d / taper, 1)), d [rad] the distance of a pixel to the nearest one that is not
     ``inside``, (ny, nx).
 

@@ -21,12 +21,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.maps.apertures import COMPLETE, Aperture
 from zonda.core.maps.grid import ImagePixels, MapGrid, image_grid
 from zonda.core.numerics.sphere import angles, beam_area
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 
 from .planes import Plane, cell_of, common, on_a_plane
 from .radial import Profiles, RadialSpectra, profiles, radial_spectra, ring_edges, tapered
@@ -204,7 +203,7 @@ def _cropped(a: Plane, b: Plane) -> tuple[Plane, Plane]:
     return first, second
 
 
-def _weights(grid: MapGrid, known: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _weights(grid: MapGrid, known: Bools) -> tuple[Floats, Floats]:
     """Solid angles of the pixels [sr], 0 for those that repeat another; and what pixels count:
     equal ones 1 each.
     """
