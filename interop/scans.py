@@ -5,7 +5,6 @@ of other packages.
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -14,12 +13,13 @@ import numpy as np
 from zonda.core.data import Data, Observation, kept, one_scan
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_MASK
+from zonda.core.storage.files import AnyPath
 from zonda.core.types import Bools, Floats
 from zonda.operators.io.recorded_stream import RecordedStream
 from zonda.operators.io.save_tod import reader
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
-Source = Data | Observation | TimeOrderedData | str | os.PathLike[str]
+Source = Data | Observation | TimeOrderedData | AnyPath
 """The result of `Pipeline.run`, one of its observations, what `load_tod` returned, or the path of
 such a file.
 """
@@ -93,7 +93,7 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
 
 
 def _read(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     stream: str,
 ) -> tuple[TimeOrderedData, Floats, Bools | None]:
     """Read a file without its other streams, and the single samples that it flags."""

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.errors import InputError
 from zonda.core.flags import DETECTOR_MASK, SAMPLE_MASK, TURNAROUND, samples_in
 from zonda.core.machine import needed
 from zonda.core.numerics.celestial import orientation
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats
 from zonda.operators.io.axismanager import SAMPLES, SCANS, UNION
 from zonda.operators.io.time_ordered_data import TimeOrderedData
 
@@ -216,7 +215,7 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
     so3g = needed("so3g.proj", EXTRA)
     tod, flags = scan.tod, core.FlagManager.for_tod(aman)
 
-    def of_samples(where: NDArray[np.bool_]) -> Any:
+    def of_samples(where: Bools) -> Any:
         ranges = so3g.Ranges.from_mask(where)
         return so3g.RangesMatrix([ranges.copy() for _ in tod.names])
 
@@ -239,7 +238,7 @@ def _flags(core: Any, aman: Any, scan: Scan) -> Any:
     return flags
 
 
-def _scans(tod: TimeOrderedData) -> dict[str, NDArray[np.bool_]]:
+def _scans(tod: TimeOrderedData) -> dict[str, Bools]:
     """Masks (n_samp,) of samples in turnarounds and, of a scan that goes back and forth, of those
     in throws of either direction, by sotodlib's names.
     """

@@ -22,6 +22,8 @@ from typing import IO, Any, Literal
 from .. import machine
 from ..errors import InputError, OutputError, ZondaError
 
+AnyPath = str | os.PathLike[str]
+"""Path of a file or folder."""
 _CURES = {
     errno.ENOSPC: ("no space left on the disk", "free some space or choose another output folder"),
     errno.EDQUOT: ("the disk quota is used up", "free some space or choose another output folder"),
@@ -53,7 +55,7 @@ RECORDS: list[Any] = []
 """Records (`output_folder.Record`) of the output folders of runs at work."""
 
 
-def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:
+def output_error(error: OSError, path: AnyPath) -> OutputError:
     """The `OutputError` that tells the user what an operating-system error on ``path`` means and
     how to mend it.
 
@@ -73,7 +75,7 @@ def output_error(error: OSError, path: str | os.PathLike[str]) -> OutputError:
 
 
 @contextlib.contextmanager
-def writing(path: str | os.PathLike[str]) -> Iterator[None]:
+def writing(path: AnyPath) -> Iterator[None]:
     """Raise an `OutputError` about ``path`` for every operating-system error in the body."""
     try:
         yield
@@ -179,14 +181,14 @@ UNPACKED_MAX = 4_000_000_000
 """Bytes that a compressed FITS file, or the tiles of an image, may unpack to."""
 
 
-def _only_member(path: str | os.PathLike[str], mode: Literal["rb"]) -> IO[bytes]:
+def _only_member(path: AnyPath, mode: Literal["rb"]) -> IO[bytes]:
     archive = zipfile.ZipFile(path)
     if len(members := archive.infolist()) != 1:
         raise ValueError(f"a zip archive of {len(members)} files, not one")
     return archive.open(members[0])
 
 
-def _compress(path: str | os.PathLike[str], mode: str) -> IO[bytes]:
+def _compress(path: AnyPath, mode: str) -> IO[bytes]:
     raise ValueError("it is packed with compress; unpack it first")
 
 
@@ -212,7 +214,7 @@ def too_large(message: str, place: str) -> InputError:
     )
 
 
-def check_kind(path: str | os.PathLike[str]) -> None:
+def check_kind(path: AnyPath) -> None:
     """Raise ValueError for a pipe or a device, whose reader might wait for ever, and OSError for a
     path that leads nowhere.
     """
@@ -221,20 +223,20 @@ def check_kind(path: str | os.PathLike[str]) -> None:
         raise ValueError("it is a pipe or a device, not a file")
 
 
-def _opener(path: str | os.PathLike[str]) -> Any:
+def _opener(path: AnyPath) -> Any:
     check_kind(path)
     with open(path, "rb") as file:
         magic = file.read(4)
     return next((opener for begin, opener in OPENERS.items() if magic.startswith(begin)), open)
 
 
-def is_packed(path: str | os.PathLike[str]) -> bool:
+def is_packed(path: AnyPath) -> bool:
     """True for a file that begins as gzip, bzip2, xz or zip do."""
     return _opener(path) is not open
 
 
 @contextlib.contextmanager
-def _unpacking(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+def _unpacking(path: AnyPath) -> Iterator[IO[bytes]]:
     """A file to read from, unpacked if it is compressed. Raises ValueError for content that cannot
     be unpacked, and OSError.
     """
@@ -247,13 +249,13 @@ def _unpacking(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         raise ValueError(f"it cannot be unpacked ({error})") from error
 
 
-def first_bytes(path: str | os.PathLike[str], size: int = 9) -> bytes:
+def first_bytes(path: AnyPath, size: int = 9) -> bytes:
     """The first bytes of a file's content, unpacked if it is compressed. Raises as `unpacked`."""
     with _unpacking(path) as file:
         return file.read(size)
 
 
-def unpacked(path: str | os.PathLike[str], place: str, most: int) -> bytes:
+def unpacked(path: AnyPath, place: str, most: int) -> bytes:
     """The content of a file, unpacked if it is compressed.
 
     Raises `InputError` for more than ``most`` bytes or than memory has free, ValueError for content
@@ -268,7 +270,7 @@ def unpacked(path: str | os.PathLike[str], place: str, most: int) -> bytes:
     return content
 
 
-def temporary_sibling(path: str | os.PathLike[str]) -> Path:
+def temporary_sibling(path: AnyPath) -> Path:
     """A hidden name beside ``path``, with its suffix (writers choose the format by it), that no
     other run uses.
     """
@@ -297,7 +299,7 @@ def put(path: Path, content: bytes) -> None:
         raise
 
 
-def open_own(path: str | os.PathLike[str], flags: int, mode: int = 0o644) -> int:
+def open_own(path: AnyPath, flags: int, mode: int = 0o644) -> int:
     """Descriptor of a file that zonda alone names, in a folder that others may write to: it follows
     no link and waits for no pipe.
 
@@ -330,7 +332,7 @@ def discard(temporary: Path) -> None:
 
 
 @contextlib.contextmanager
-def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: AnyPath) -> Iterator[Path]:
     """A temporary sibling of ``path`` to write to: renamed to ``path`` on success, removed on any
     failure or Ctrl-C.
 
@@ -357,14 +359,14 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise
 
 
-def write_text(path: str | os.PathLike[str], text: str) -> Path:
+def write_text(path: AnyPath, text: str) -> Path:
     """Write a UTF-8 text file atomically, and return its path."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
 
 
-def product_path(folder: str | os.PathLike[str], name: str, suffix: str = "") -> Path:
+def product_path(folder: AnyPath, name: str, suffix: str = "") -> Path:
     """Path of a product called ``name`` in ``folder``: it never leaves the folder and is a legal
     file name everywhere.
 
@@ -381,7 +383,7 @@ def product_path(folder: str | os.PathLike[str], name: str, suffix: str = "") ->
     return Path(folder) / f"{stem[:180]}{suffix}"
 
 
-def make_folder(path: str | os.PathLike[str]) -> Path:
+def make_folder(path: AnyPath) -> Path:
     """Make a folder and those above it; its path. Raises OSError, and `OutputError` where the file
     system takes no new ones.
     """
@@ -399,7 +401,7 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
-def check_output_folder(path: str | os.PathLike[str]) -> Path:
+def check_output_folder(path: AnyPath) -> Path:
     """Create an output folder and prove that it takes files, before a long run starts; its path.
 
     Raises

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from . import files
-from .files import check_memory, reading
+from .files import AnyPath, check_memory, reading
 
 FIELDS_MAX = 999
 """Axes of an array, and columns of a table, that FITS 4.0 allows (4.4.1, 7.3.1); astropy loops over
@@ -103,7 +103,7 @@ def table_bytes(table: fits.BinTableHDU) -> bytes:
 
 @contextlib.contextmanager
 def opened(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     place: str,
     cure: str,
     kind: str = "FITS",

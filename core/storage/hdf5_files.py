@@ -11,14 +11,14 @@ from collections.abc import Iterator
 from typing import Any
 
 from ..errors import InputError
-from .files import check_kind, check_memory, reading
+from .files import AnyPath, check_kind, check_memory, reading
 
 COMPRESSION_MAX = 1100
 """Bytes in memory per byte of the file: deflate, the densest filter in use, reaches 1032."""
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> Iterator[Any]:
+def opened(path: AnyPath, place: str, kind: str, cure: str) -> Iterator[Any]:
     """An `h5py.File` to read from; whatever goes wrong in the body is an `InputError` about
     ``place``.
 
@@ -29,7 +29,7 @@ def opened(path: str | os.PathLike[str], place: str, kind: str, cure: str) -> It
         yield file
 
 
-def checked(path: str | os.PathLike[str], place: str) -> Any:
+def checked(path: AnyPath, place: str) -> Any:
     """An `h5py.File` that the caller closes; it refuses what `opened` refuses.
 
     Other errors are those of h5py.
@@ -119,7 +119,7 @@ class Disk:
     Raises OSError at the next `check` or `close`; whatever is written after a failure is dropped.
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: AnyPath) -> None:
         self._file = open(path, "w+b", buffering=0)  # noqa: SIM115
         self._error: OSError | None = None
 

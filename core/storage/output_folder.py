@@ -192,7 +192,7 @@ def _read(folder: Path) -> dict[str, set[Stamp]]:
 
 
 @contextlib.contextmanager
-def lock(folder: str | os.PathLike[str], part: str = "") -> Iterator[None]:
+def lock(folder: files.AnyPath, part: str = "") -> Iterator[None]:
     """Hold a folder while the body runs.
 
     Parameters

@@ -5,7 +5,6 @@ alone, streams in rectangles.
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -28,6 +27,7 @@ from zonda.core.flags import (
     intervals_of,
 )
 from zonda.core.numerics.quaternions import detector_quaternions, from_angles, multiply
+from zonda.core.storage.files import AnyPath
 from zonda.core.storage.hdf5_files import check_size
 from zonda.core.types import Bools, Floats, Indices, Integers
 
@@ -68,7 +68,7 @@ BAND = re.compile(r"(?:.*_)?f?(\d+(?:\.\d+)?) ?(?:ghz)?", re.IGNORECASE)
 """Names of bands with their centre: f150, so_145ghz, 150 GHz."""
 
 
-def holds_axismanager(path: str | os.PathLike[str]) -> bool:
+def holds_axismanager(path: AnyPath) -> bool:
     """True for an HDF5 file with an AxisManager at its root, or in its first group."""
     import h5py
 

@@ -16,7 +16,7 @@ from astropy.io import fits
 
 from zonda.core.errors import InputError
 from zonda.core.maps.map_file import ascii_text
-from zonda.core.storage.files import UNPACKED_MAX, is_packed, unpacked, writing
+from zonda.core.storage.files import UNPACKED_MAX, AnyPath, is_packed, unpacked, writing
 from zonda.core.storage.fits_files import check_size, opened, table_bytes
 from zonda.core.stream import UNITS
 from zonda.core.types import AnyFloats, Floats, Indices
@@ -193,7 +193,7 @@ class Reader:
         No such file, not FITS, one of the tables is missing, or the file is compressed.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, whole: bool = False) -> None:
+    def __init__(self, path: AnyPath, *, whole: bool = False) -> None:
         self.place = f"time-ordered data {path}"
         with opened(path, self.place, CURE) as file:
             for hdu in file:

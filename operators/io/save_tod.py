@@ -4,7 +4,6 @@ tables.
 
 from __future__ import annotations
 
-import os
 import threading
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from zonda.core.errors import InputError, OutputError
 from zonda.core.flags import DETECTOR_MASK
 from zonda.core.output import StreamOutput, output_folder
 from zonda.core.product import Record
-from zonda.core.storage.files import atomic_path, check_memory, product_path
+from zonda.core.storage.files import AnyPath, atomic_path, check_memory, product_path
 from zonda.core.stream import UNITS, StreamName, streams_asked, streams_needed
 from zonda.core.weather import GroundWeather
 
@@ -173,7 +172,7 @@ def _provenance(data: Data) -> dict[str, str | int | float]:
     return found
 
 
-def load_tod(path: str | os.PathLike[str]) -> TimeOrderedData:
+def load_tod(path: AnyPath) -> TimeOrderedData:
     """Read a file that `SaveTOD` wrote, or another TOAST layout-2 HDF5 file. Temperatures are
     converted to K; single samples that it flags (`DETECTOR_MASK`) become NaN.
 
@@ -203,7 +202,7 @@ def load_tod(path: str | os.PathLike[str]) -> TimeOrderedData:
     return tod
 
 
-def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
+def save_tod(path: AnyPath, tod: TimeOrderedData) -> Path:
     """Write a whole scan, ``tod.streams`` included; the format follows the suffix (.h5, .hdf5,
     .fits). Returns the path.
 
@@ -231,7 +230,7 @@ def save_tod(path: str | os.PathLike[str], tod: TimeOrderedData) -> Path:
 
 
 def reader(
-    path: str | os.PathLike[str],
+    path: AnyPath,
     *,
     whole: bool = False,
 ) -> fits_table.Reader | toast_hdf5.Reader:
@@ -245,7 +244,7 @@ def reader(
     return toast_hdf5.Reader(path)
 
 
-def is_fits(path: str | os.PathLike[str]) -> bool:
+def is_fits(path: AnyPath) -> bool:
     """True if the path names a FITS file."""
     name = Path(path).name.lower()
     return name.endswith((".fits", ".fit", ".fits.gz", ".fit.gz"))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -22,7 +21,7 @@ from zonda.core.configuration.time import Instant
 from zonda.core.configuration.units import Unit
 from zonda.core.errors import InputError
 from zonda.core.flags import INVALID, Flags
-from zonda.core.storage.files import reading, writing
+from zonda.core.storage.files import AnyPath, reading, writing
 from zonda.core.storage.hdf5_files import Disk, check_size, checked, read_columns
 from zonda.core.stream import UNITS
 from zonda.core.types import AnyFloats, Floats, Indices
@@ -328,7 +327,7 @@ class Reader:
     kind: ClassVar[str] = "HDF5 in TOAST's layout"
     cure: ClassVar[str] = "give an HDF5 file in TOAST's layout, whole, as SaveTOD writes it"
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(self, path: AnyPath) -> None:
         self.place = f"time-ordered data {path}"
         with self._reading():
             self._file = checked(path, self.place)
