@@ -73,6 +73,10 @@ def kernel(
             numba.config.CACHE_DIR = before
 
 
+contracted = kernel(fastmath={"contract", "nsz"})
+"""`kernel` that may fuse products with sums, and takes -0 for 0; it takes further options, too."""
+
+
 @functools.cache
 def folder() -> Path | None:
     """Folder of machine code, with its lock installed; None, after a warning, where nothing can be

@@ -33,7 +33,7 @@ import numpy as np
 from numba import float32, int32, int64, uint32, uint64
 from numpy.typing import NDArray
 
-from ..kernels import kernel
+from ..kernels import contracted, kernel
 
 TILE = 1024
 """Numbers made together."""
@@ -283,7 +283,7 @@ def philox(key, c0, c1, c2, c3, words):  # type: ignore[no-untyped-def]
         out0[b], out1[b], out2[b], out3[b] = uint32(x0), uint32(x1), uint32(x2), uint32(x3)
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def box_muller(a, b, bits, one, two):  # type: ignore[no-untyped-def]
     """Two arrays of normal deviates ``one, two`` (n,) float32 from two of random words ``a, b``
     (n,) uint32.

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from zonda.core.kernels import kernel
+from zonda.core.kernels import contracted, kernel
 from zonda.core.numerics.smooth import spline_basis
 from zonda.core.types import Floats, Integers
 
@@ -267,7 +267,7 @@ def _total(x):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def lessen(x, c, f):  # type: ignore[no-untyped-def]
     """x -= c f, of two chunks."""
     for t in range(nb.uint64(x.size)):

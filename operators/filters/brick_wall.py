@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from scipy.fft import dct, next_fast_len
 
-from zonda.core.kernels import kernel
+from zonda.core.kernels import contracted
 from zonda.core.numerics.chunks import TILE_DETECTORS, chunks, empty
 from zonda.core.numerics.smooth import product, spline_basis
 from zonda.core.types import AnyFloats, Indices, Integers
@@ -351,7 +351,7 @@ def bridge_adjoint(row: AnyFloats, gaps: Indices) -> None:
     np.add.at(row, right, share * values)
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _spread(rows, first, weights, s):  # type: ignore[no-untyped-def]
     """s[first + j, d] += sum_n weights[j, n] rows[d, n] of up to `ABREAST` rows (n_det, N): s
     (n_knot, ABREAST).
@@ -390,7 +390,7 @@ AT_ONCE = 64
 """Groups that all rows pass through together, while their weights are in the cache."""
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _subtract(rows, first, weights, c):  # type: ignore[no-untyped-def]
     """rows[d, n] -= sum_j weights[j, n] c[d, first + j]."""
     n_det, n, w = np.uintp(rows.shape[0]), np.uintp(rows.shape[1]), weights

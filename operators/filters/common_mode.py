@@ -38,7 +38,7 @@ from pydantic import Field, model_validator
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.flags import DEAD
-from zonda.core.kernels import kernel
+from zonda.core.kernels import contracted
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.signal import MAIN
 from zonda.core.types import Bools, Floats
@@ -156,7 +156,7 @@ LANES = 32
 """
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def add_moments(row, lanes, out):  # type: ignore[no-untyped-def]
     """Add the sum and the sum of squares of ``row`` (n,) to ``out`` (2,). ``lanes`` (2, LANES):
     scratch.
@@ -180,7 +180,7 @@ def add_moments(row, lanes, out):  # type: ignore[no-untyped-def]
         out[1] += second[i]
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _look(part, start, stop, use, sums, range_of, moments):  # type: ignore[no-untyped-def]
     """Add samples start .. stop - 1 of ``part`` to ``sums`` (tiles, n), ``range_of`` (2, n) and
     ``moments`` (2, n_det).
@@ -524,7 +524,7 @@ def _sees_nothing(stream: Stream) -> bool:
     return stream.signal != MAIN or of_the_sky
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _remove(signal, u, v):  # type: ignore[no-untyped-def]
     """signal -= u v^T in float64, rounded once."""
     n_det, n = signal.shape

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.kernels import kernel
+from zonda.core.kernels import contracted, kernel
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks, empty
 from zonda.core.numerics.random import normals, stream_key
 from zonda.core.stream import Stream, columns
@@ -447,7 +447,7 @@ def _products(array, start, stop, q, rows, v, moments, out):  # type: ignore[no-
             _image(array, low, high, rows, series, None, out[k:])
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
     """v = A^T q at samples start .. stop - 1, eight detectors at a time."""
     n = stop - start
@@ -474,7 +474,7 @@ def _project(array, start, stop, q, rows, v):  # type: ignore[no-untyped-def]
             v[t] += q0 * np.float64(a[t])
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _image(array, begin, end, rows, series, moments, out):  # type: ignore[no-untyped-def]
     """out[:, 2] = A v of each tile of the samples begin .. end - 1, four detectors at a time;
     unless ``moments`` is None, out[:, 0] = A 1 and out[:, 1] = squares in the same reading."""

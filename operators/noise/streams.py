@@ -12,7 +12,7 @@ import numpy as np
 from numba import uint64
 from numpy.typing import NDArray
 
-from zonda.core.kernels import kernel
+from zonda.core.kernels import contracted
 from zonda.core.numerics.chunks import TILE_DETECTORS
 from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, normal_tile, normals
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
@@ -196,7 +196,7 @@ def _pieces(start: int, stop: int, size: int) -> list[tuple[int, int]]:
     return list(pairwise(cuts)) if stop > start else []
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _filter(  # type: ignore[no-untyped-def]
     key,
     tile,
@@ -261,7 +261,7 @@ def _filter(  # type: ignore[no-untyped-def]
                 row[t] += size[t] * mixed[t]
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _pair(x, s, pair):  # type: ignore[no-untyped-def]
     """Equation (3) in place on x (m, 16) and the pair's state s (2, 16), both flat."""
     a, b, to_real, to_imaginary = pair[0], pair[1], pair[2], pair[3]
@@ -274,7 +274,7 @@ def _pair(x, s, pair):  # type: ignore[no-untyped-def]
             x[now + d] = y + (to_real * r + to_imaginary * i)
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _four_sections(x, s, rate, tap):  # type: ignore[no-untyped-def]
     """Four sections in place on x (m, 16) and their states s (4, 16), both flat. The inner loop
     fills vector registers.

@@ -27,7 +27,7 @@ from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Fraction
 from zonda.core.data import Block, Observation
 from zonda.core.errors import PipelineError
-from zonda.core.kernels import kernel
+from zonda.core.kernels import contracted
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.random import normals
@@ -210,7 +210,7 @@ def _sum(block: Block, name: str, others: Sequence[str]) -> AnyFloats:
     return total
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _calibrate_sky(sky, fluctuation, gain, out):  # type: ignore[no-untyped-def]
     """Equation (2) where there is nothing but the sky: the same bits in a third of the time."""
     one = out.dtype.type(1)
@@ -226,7 +226,7 @@ def _calibrate_sky(sky, fluctuation, gain, out):  # type: ignore[no-untyped-def]
     return 0
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _calibrate(  # type: ignore[no-untyped-def]
     sky,
     fluctuation,

@@ -27,7 +27,7 @@ import numpy as np
 from numba import int32, uint64
 from numpy.typing import NDArray
 
-from zonda.core.kernels import kernel
+from zonda.core.kernels import contracted
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.columns import spline_of_four
 from zonda.core.types import AnyFloats, Floats, Indices
@@ -135,7 +135,7 @@ def pointing(
     return Chunks(h, box, limits, ones)
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _point(  # type: ignore[no-untyped-def]
     quaternions, matrix, ny, nx, bounds, h, box, limits, ones
 ):
@@ -204,7 +204,7 @@ def _point(  # type: ignore[no-untyped-def]
             )  # far away no sample is on the grid and any number will do
 
 
-@kernel(fastmath={"contract", "nsz"})
+@contracted
 def _add_map(  # type: ignore[no-untyped-def]
     h, box, limits, ones, xi, eta, rows, f, nx, covered, constants, linear, over, out
 ):
@@ -259,7 +259,7 @@ def _add_map(  # type: ignore[no-untyped-def]
 # are compiled before, too.
 
 
-@kernel(fastmath={"contract", "nsz"}, inline="always")
+@contracted(inline="always")
 def _misses(box, a, b, limits):  # type: ignore[no-untyped-def]
     """True if a detector at (a, b) = (xi, eta) is in front of the map and a pixel or more off it at
     every instant of a chunk.
@@ -284,7 +284,7 @@ def _misses(box, a, b, limits):  # type: ignore[no-untyped-def]
     return False
 
 
-@kernel(fastmath={"contract", "nsz"}, inline="always")
+@contracted(inline="always")
 def _between(box, k, a, b):  # type: ignore[no-untyped-def]
     """Bounds of h_k a + h_(k+1) b + h_(k+2)."""
     p, q = a * box[k, 0], a * box[k, 1]
@@ -292,7 +292,7 @@ def _between(box, k, a, b):  # type: ignore[no-untyped-def]
     return min(p, q) + min(r, s) + box[k + 2, 0], max(p, q) + max(r, s) + box[k + 2, 1]
 
 
-@kernel(fastmath={"contract", "nsz"}, inline="always")
+@contracted(inline="always")
 def _locate(  # type: ignore[no-untyped-def]
     h, a, b, count, limits, constants, ones, width, place, u, v
 ):
@@ -323,7 +323,7 @@ def _locate(  # type: ignore[no-untyped-def]
     return inside, front
 
 
-@kernel(fastmath={"contract", "nsz"}, inline="always")
+@contracted(inline="always")
 def _count_covered(place, u, v, count, width, covered):  # type: ignore[no-untyped-def]
     """The number of samples whose nearest grid point is covered."""
     total = int32(0)
@@ -334,7 +334,7 @@ def _count_covered(place, u, v, count, width, covered):  # type: ignore[no-untyp
     return total
 
 
-@kernel(fastmath={"contract", "nsz"}, inline="always")
+@contracted(inline="always")
 def _span_on_grid(place, count):  # type: ignore[no-untyped-def]
     """The multiples of four between which all samples on the grid lie; what is filled up behind
     ``count`` is off the grid.
@@ -352,7 +352,7 @@ def _span_on_grid(place, count):  # type: ignore[no-untyped-def]
     return first, stop
 
 
-@kernel(fastmath={"contract", "nsz"}, inline="always")
+@contracted(inline="always")
 def _spline(place, u, v, first, stop, constants, at, weights):  # type: ignore[no-untyped-def]
     """The cubic B-spline weights (8, CHUNK), four along x, four along y; ``at``: ``place``, 0 for
     samples off the grid.
@@ -383,7 +383,7 @@ def _spline(place, u, v, first, stop, constants, at, weights):  # type: ignore[n
         at[t] = max(place[t], int32(0))
 
 
-@kernel(fastmath={"contract", "nsz"}, inline="always")
+@contracted(inline="always")
 def _add_bilinear(f, place, u, v, first, stop, nx, constants, row):  # type: ignore[no-untyped-def]
     """The four grid points around each sample, one right and one up of its first spline
     coefficient; 0 off the grid.
