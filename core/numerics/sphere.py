@@ -24,12 +24,12 @@ def beam_area(fwhm: float) -> float:
     return math.pi / math.log(16) * fwhm**2
 
 
-def angle_text(value: float, digits: int = 3) -> str:
+def angle_text(value: float) -> str:
     """``4°``, ``1.5′``, ``8.5″``, of rad."""
     for unit, name in ((60 * ARCMIN, "°"), (ARCMIN, "′")):
         if abs(value) >= unit:
-            return f"{value / unit:.{digits}g}{name}"
-    return f"{value / ARCSEC:.{digits}g}″"
+            return f"{value / unit:.3g}{name}"
+    return f"{value / ARCSEC:.3g}″"
 
 
 def sides_text(y: float, x: float) -> str:

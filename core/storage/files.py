@@ -299,7 +299,7 @@ def put(path: Path, content: bytes) -> None:
         raise
 
 
-def open_own(path: AnyPath, flags: int, mode: int = 0o644) -> int:
+def open_own(path: AnyPath, flags: int) -> int:
     """Descriptor of a file that zonda alone names, in a folder that others may write to: it follows
     no link and waits for no pipe.
 
@@ -311,7 +311,7 @@ def open_own(path: AnyPath, flags: int, mode: int = 0o644) -> int:
         As `os.open`.
     """
     try:
-        opened = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, mode)
+        opened = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
         if stat.S_ISREG(os.fstat(opened).st_mode):
             return opened
         os.close(opened)

@@ -37,15 +37,16 @@ does not double amplitudes.
 """
 MODES = 4
 """Modes whose streams are drawn."""
+PER_DECADE = 24
+"""Bins of a spectrum."""
 
 
 def _binned(
     frequency: AnyFloats,
     psd: AnyFloats,
-    per_decade: int = 24,
 ) -> tuple[AnyFloats, AnyFloats]:
     """Means of a spectrum in logarithmic bins (each at least one frequency wide)."""
-    position = np.floor(np.log10(frequency / frequency[0]) * per_decade).astype(int)
+    position = np.floor(np.log10(frequency / frequency[0]) * PER_DECADE).astype(int)
     _, first = np.unique(position, return_index=True)
     count = np.diff(np.append(first, frequency.size))
     return np.add.reduceat(frequency, first) / count, np.add.reduceat(psd, first) / count

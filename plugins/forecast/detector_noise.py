@@ -41,6 +41,7 @@ FAR = 12.0
 """-ln K up to which a sample counts."""
 STEP = (0.7548776662466927, 0.5698402909980532)
 """Steps of a low-discrepancy sequence in the plane (Roberts 2018)."""
+MOST_COMBS = 8
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Comb:
     inside: Bools
 
 
-def combs(survey: Survey, radius: float, probes: int, most: int = 8) -> list[Comb]:
+def combs(survey: Survey, radius: float, probes: int) -> list[Comb]:
     """Combs with about ``probes`` probes in a circle of ``radius`` [rad] together; the first has
     one at its centre.
     """
@@ -76,7 +77,7 @@ def combs(survey: Survey, radius: float, probes: int, most: int = 8) -> list[Com
         if inside.any():
             found.append(Comb(origin, spacing, inside))
             total += int(inside.sum())
-        if total >= probes or len(found) >= most:
+        if total >= probes or len(found) >= MOST_COMBS:
             break
     return found
 
