@@ -117,7 +117,7 @@ class FigureMetric(Metric, Parameters):
         return np.array(self.find(data, names_of(data, self.needs())), np.float64)
 
     def summary(self, found: Floats) -> Floats:
-        return np.asarray(found[:1], np.float64)
+        return found[:1]
 
     def floor(self, reference: Floats) -> float | None:
         """The standard error, relative to the value."""

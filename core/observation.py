@@ -420,7 +420,7 @@ class Observation:
     def seconds_at(self, index: Integers) -> Floats:
         """`seconds` at sample numbers, which go on at `sample_rate` beyond the ends of the scan."""
         inside = np.clip(index, 0, self.n_samples - 1)
-        return np.asarray(self.seconds[inside] + (index - inside) / self.sample_rate, np.float64)
+        return self.seconds[inside] + (index - inside) / self.sample_rate
 
     @property
     def sky_boresight(self) -> Floats:

@@ -424,4 +424,4 @@ class MapArrays:
         )
         if areas.max() < 1.001 * areas.min():
             return beam / (float(areas.mean()) if self.projection == "CAR" else self.pixel**2)
-        return np.asarray(np.broadcast_to(beam / areas, self.signal.shape), np.float64)
+        return np.broadcast_to(beam / areas, self.signal.shape)

@@ -155,12 +155,12 @@ class Pair:
     def coherence(self) -> Floats:
         """Equation (3); NaN where a spectrum is zero."""
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.abs(self.cross) ** 2 / (self.power * self.reference), np.float64)
+            return np.abs(self.cross) ** 2 / (self.power * self.reference)
 
     def rest(self, gain: float) -> Floats:
         """P_e of x - gain y; P_d for 1."""
         rest = self.power + gain**2 * self.reference - 2 * gain * self.cross.real
-        return np.asarray(np.maximum(rest, 0.0), np.float64)
+        return np.maximum(rest, 0.0)
 
 
 def pair(x: Floats, y: Floats, welch: Welch) -> Pair:
@@ -274,7 +274,7 @@ class StreamComparison(Series):
     @property
     def bias(self) -> Floats:
         """(n,) of the coherence, equation (4)."""
-        return np.asarray((1 - self.coherence) ** 2 / self.segments, np.float64)
+        return (1 - self.coherence) ** 2 / self.segments
 
     def meta(self) -> dict[str, Any]:
         """The streams, and the number of segments."""

@@ -264,7 +264,7 @@ class Transfer:
     @property
     def kilolambda(self) -> Floats:
         """(n,) the same as lengths of baselines in 1000 wavelengths."""
-        return np.asarray(1e-3 / self.scale, np.float64)
+        return 1e-3 / self.scale
 
     @property
     def meta(self) -> dict[str, str]:

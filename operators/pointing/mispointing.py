@@ -93,7 +93,7 @@ def _markov(rho: float, drawn: Floats) -> Floats:
     step = math.sqrt(1 - rho * rho)
     scaled = step * drawn
     scaled[0] = drawn[0]
-    return np.asarray(lfilter([1.0], [1.0, -rho], scaled), np.float64)
+    return lfilter([1.0], [1.0, -rho], scaled)
 
 
 def beside(quaternions: Floats, x: Floats, y: Floats) -> Floats:

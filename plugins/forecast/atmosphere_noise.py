@@ -238,7 +238,7 @@ def _footprint(offsets: Floats, sigma: float) -> tuple[Floats, float, float]:
 def _spectrum(found: Calibrated, layer: int, number: Floats) -> Floats:
     """P_l at wave numbers [rad/m], m2, of unit variance before the beam."""
     e, w = found.components[layer]
-    return np.asarray((4 * np.pi * e * w) @ np.exp(-np.multiply.outer(e, number**2)), np.float64)
+    return (4 * np.pi * e * w) @ np.exp(-np.multiply.outer(e, number**2))
 
 
 def _expected(survey: Survey, found: Calibrated) -> list[Floats]:

@@ -102,7 +102,7 @@ def as_seen(image: Image, product: MapProduct, fwhm: float | None = None) -> Flo
     grid = product.grid
     x, y = own.coordinates(grid.directions() @ grid.turn @ own.turn.T)  # either may be galactic
     at = np.where(np.isfinite(x) & np.isfinite(y), [y, x], -2.0)
-    return np.asarray(map_coordinates(np.nan_to_num(smooth), at, order=3), np.float64)
+    return map_coordinates(np.nan_to_num(smooth), at, order=3)
 
 
 def extreme(values: Floats, where: Bools, metric: str) -> tuple[int, float]:

@@ -142,7 +142,7 @@ class Peak(OfParts):
         ]
 
     def summary(self, found: Floats) -> Floats:
-        return np.asarray(found[:1], np.float64)
+        return found[:1]
 
     def floor_of(self, reference: Floats) -> float | None:
         """The smoothed map's instrument noise at the peak."""
@@ -301,7 +301,7 @@ def _uncertain(d: Floats, noise: float, pairs: Floats) -> Floats:
     equation (6).
     """
     error = np.sqrt((8 * noise**4 + 8 * noise**2 * d) / pairs)
-    return np.asarray(error / np.maximum(d, 1e-300), np.float64)
+    return error / np.maximum(d, 1e-300)
 
 
 def _mean_square(values: Floats, weights: Floats, use: Bools) -> float:

@@ -147,7 +147,7 @@ class Layers:
             k.water + 2 * water * k.water_self - k.dry_air - heavier[:, None] * self._each(k)
         )  # per molecule of air
         columns = (1 - self.h2o * heavier) * PWV_OF_MOLECULE  # d PWV / d mixing ratio, likewise
-        return np.asarray(of_mixing / columns[:, None], np.float64)
+        return of_mixing / columns[:, None]
 
     @property
     def water(self) -> Floats:

@@ -191,7 +191,7 @@ class RadialSpectra:
 def scale_of(wavenumber: Floats, edges: Floats) -> Floats:
     """(n,) angular scales 1/k, rad; in a ring without modes its middle."""
     middle = np.sqrt(edges[1:] * edges[:-1])
-    return np.asarray(1 / np.where(np.isfinite(wavenumber), wavenumber, middle), np.float64)
+    return 1 / np.where(np.isfinite(wavenumber), wavenumber, middle)
 
 
 def ring_edges(shape: tuple[int, int], steps: float | Floats, bins: int) -> Floats:
@@ -298,7 +298,7 @@ def _of_noise(error: Floats, steps: float | Floats, smoothing: float) -> Floats:
     away = (np.tensordot(cell(steps), np.stack(lags), 1) ** 2).sum(axis=0)
     found = np.fft.ifft2(np.abs(np.fft.fft2(error)) ** 2).real
     found = np.fft.fft2(found * np.exp(-away / (4 * smoothing**2))).real
-    return np.asarray(np.maximum(found, 0.0), np.float64)
+    return np.maximum(found, 0.0)
 
 
 @dataclass(frozen=True)
