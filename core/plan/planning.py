@@ -56,14 +56,6 @@ class Knob:
         )
         return [adapter.validate_python(value) for value in self.ladder]
 
-    def coarser(self, model: BaseModel) -> list[Any]:
-        """The rungs that are coarser than the model's own value, the finest of them first."""
-        rungs, own = self.values(type(model)), getattr(model, self.parameter)
-        if own in rungs:
-            return rungs[: rungs.index(own)][::-1]
-        rising = rungs[0] < rungs[-1]
-        return [rung for rung in reversed(rungs) if (rung < own) == rising]
-
 
 PRECISION = Knob("precision", ("float32", "float64"), "rounding of the time streams")
 """The one knob that belongs to a pipeline, not to an operator."""
@@ -126,14 +118,6 @@ class Planning(Generic[O]):
     def estimate(self, context: Context) -> Estimate:
         """Upper bounds on what its effects contribute, and coarser forms of them."""
         return Estimate()
-
-    def coarser(self, parameter: str) -> list[Any]:
-        """The rungs of a knob that are coarser than the operator's own value, the finest of them
-        first.
-        """
-        return next(knob for knob in self.knobs if knob.parameter == parameter).coarser(
-            self.operator
-        )
 
     def memory(self, observation: Observation) -> int:
         """Bytes that the step will hold for one observation, besides streams and blocks: tables,
