@@ -35,6 +35,7 @@ from ..machine import (
     SAFE,
     available_memory,
     available_threads,
+    needed,
     one_blas_thread,
     resident_memory,
     restore,
@@ -247,22 +248,20 @@ def begin_worker(safe: str | None = None) -> None:
 @contextlib.contextmanager
 def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
     try:
-        from mpi4py import MPI
-        from mpi4py.futures import MPICommExecutor
-    except ImportError as err:
-        raise _missing("mpi4py", "mpi", err) from None
+        mpi = needed("mpi4py.MPI", "mpi", "engine mpi")
+        futures = needed("mpi4py.futures", "mpi", "engine mpi")
     except RuntimeError as err:  # mpi4py is there, the library is not
         text, cure = f"MPI cannot be loaded: {first_line(err)}", "install Open MPI or MPICH"
         raise PipelineError(text, place="engine mpi", cure=cure) from None
-    size = MPI.COMM_WORLD.Get_size()
+    size = mpi.COMM_WORLD.Get_size()
     if size < 2:
         raise PipelineError(
             "there is one MPI process alone, which leaves no worker",
             place="engine mpi",
             cure="start at least two: mpiexec -n 8 zonda run FILE --engine mpi",
         )
-    beside = MPI.COMM_WORLD.Split_type(MPI.COMM_TYPE_SHARED).Get_size()  # on this machine
-    with MPICommExecutor(MPI.COMM_WORLD, root=0) as executor:
+    beside = mpi.COMM_WORLD.Split_type(mpi.COMM_TYPE_SHARED).Get_size()  # on this machine
+    with futures.MPICommExecutor(mpi.COMM_WORLD, root=0) as executor:
         mine = max(1, beside - 1) if size == beside else beside
         # true if each process has CPUs of its own, as srun gives them
         bound = available_threads() < (os.cpu_count() or 1)
@@ -284,11 +283,9 @@ def _dask(
     threads: int | None,
     memory: int | None,
 ) -> Iterator[Pool]:
-    try:
-        import dask.config
-        import distributed
-    except ImportError as err:
-        raise _missing("dask.distributed", "dask", err) from None
+    distributed, config = (
+        needed(name, "dask", "engine dask") for name in ("distributed", "dask.config")
+    )
     for logger in (
         "distributed",
         "distributed.client",
@@ -322,7 +319,7 @@ def _dask(
                 "is it running there, and are its certificates and yours signed by the same"
                 " authority (ca_file)?"
             )
-            if security is not None or not dask.config.get(
+            if security is not None or not config.get(
                 "distributed.client.security-loader",
                 None,
             ):
@@ -402,14 +399,6 @@ def _check_certificates(security: Any, address: str) -> None:
             place=address,
             cure=cure,
         ) from None
-
-
-def _missing(package: str, extra: str, err: ImportError) -> PipelineError:
-    return PipelineError(
-        f"{package} cannot be imported: {err}",
-        place=f"engine {extra}",
-        cure=f"pip install 'zonda[{extra}]'",
-    )
 
 
 R = TypeVar("R")

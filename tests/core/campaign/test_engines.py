@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from zonda.core.errors import PipelineError
+from zonda.core.errors import InputError, PipelineError
 from zonda.core.experiment import engines
 from zonda.core.experiment.engines import engine
 
@@ -244,7 +244,7 @@ def test_workers_of_mpi_leave_their_warnings_to_the_main_process(mpi):
 @pytest.mark.parametrize(("name", "module"), [("mpi", "mpi4py"), ("dask", "distributed")])
 def test_a_missing_package_is_named_with_its_cure(monkeypatch, name, module):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(PipelineError) as caught, engine(name, scheduler="tcp://127.0.0.1:1"):
+    with pytest.raises(InputError) as caught, engine(name, scheduler="tcp://127.0.0.1:1"):
         pass
     assert f"pip install 'zonda[{name}]'" in str(caught.value)
 
