@@ -85,29 +85,14 @@ def to_axismanager(
         [(0, "dets"), (1, "samps")],
     )
     azimuth, elevation, roll = _angles(tod.boresight_azel)
-    _wrap(
-        core,
-        aman,
-        "boresight",
-        "samps",
-        {"az": np.unwrap(-azimuth), "el": elevation, "roll": roll},
-    )
+    pointed = {"az": np.unwrap(-azimuth), "el": elevation, "roll": roll}
+    aman.wrap("boresight", _along(core, aman.samps, pointed))
     if len(tod.boresight_radec):
         ra, dec, psi = _angles(tod.boresight_radec)
-        _wrap(
-            core,
-            aman,
-            "boresight_equ",
-            "samps",
-            {"ra": ra % (2 * np.pi), "dec": dec, "psi": psi},
-        )
-    _wrap(
-        core,
-        aman,
-        "focal_plane",
-        "dets",
-        dict(zip(("xi", "eta", "gamma"), tod.xieta_sotodlib(), strict=True)),
-    )
+        pointed = {"ra": ra % (2 * np.pi), "dec": dec, "psi": psi}
+        aman.wrap("boresight_equ", _along(core, aman.samps, pointed))
+    offsets = dict(zip(("xi", "eta", "gamma"), tod.xieta_sotodlib(), strict=True))
+    aman.wrap("focal_plane", _along(core, aman.dets, offsets))
     if tod.hwp_angle is not None:
         aman.wrap("hwp_angle", tod.hwp_angle, [(0, "samps")])
     aman.wrap("flags", _flags(core, aman, found))
@@ -202,12 +187,12 @@ def _angles(quaternions: Floats) -> tuple[Floats, Floats, Floats]:
     return longitude, latitude, np.arctan2(w * x + y * z, w * y - x * z)
 
 
-def _wrap(core: Any, aman: Any, name: str, axis: str, columns: dict[str, Any]) -> None:
-    """Columns along an axis, as a child of the AxisManager."""
-    child = core.AxisManager(aman[axis])
+def _along(core: Any, axis: Any, columns: dict[str, Any]) -> Any:
+    """AxisManager of columns along an axis."""
+    made = core.AxisManager(axis)
     for key, values in columns.items():
-        child.wrap(key, np.ascontiguousarray(values), [(0, axis)])
-    aman.wrap(name, child)
+        made.wrap(key, np.ascontiguousarray(values), [(0, axis.name)])
+    return made
 
 
 def _flags(core: Any, aman: Any, scan: Scan) -> Any:
@@ -260,23 +245,11 @@ def _det_info(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
         else [f"{c / 1e9:.4g} GHz" for c in centre]
     )
     wafer = tod.columns.get("wafer", np.zeros(n)).astype(int)
-    info = core.AxisManager(aman.dets)
     slots = np.array([f"ws{number}" for number in wafer])
-    for name, values in {
-        "name": names,
-        "readout_id": names,
-        "det_id": names,
-        "band": band,
-        "wafer_slot": slots,
-    }.items():
-        info.wrap(name, values, [(0, "dets")])
-    _wrap(
-        core,
-        info,
-        "wafer",
-        "dets",
-        {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")},
-    )
+    about = dict.fromkeys(("name", "readout_id", "det_id"), names)
+    info = _along(core, aman.dets, {**about, "band": band, "wafer_slot": slots})
+    wafers = {"bandpass": band, "array": slots, "type": np.full(n, "OPTC")}
+    info.wrap("wafer", _along(core, info.dets, wafers))
     return info
 
 
@@ -285,12 +258,9 @@ def _det_cal(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
     n = tod.n_detectors
     dead = (tod.detector_flags & np.uint8(DETECTOR_MASK)) != 0
     group = tod.columns.get("wafer", np.zeros(n)).astype(int)
-    cal = core.AxisManager(aman.dets)
-    cal.wrap("bg", np.where(dead, -1, group), [(0, "dets")])
-    cal.wrap("bandpass", aman.det_info.band, [(0, "dets")])
-    for name, value in CALIBRATION.items():
-        cal.wrap(name, np.full(n, value), [(0, "dets")])
-    return cal
+    columns = {"bg": np.where(dead, -1, group), "bandpass": aman.det_info.band}
+    columns |= {name: np.full(n, value) for name, value in CALIBRATION.items()}
+    return _along(core, aman.dets, columns)
 
 
 def _obs_info(core: Any, tod: TimeOrderedData) -> Any:
