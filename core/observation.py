@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
-from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, Intervals, good, intervals_of
+from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, Flags, Intervals, good, intervals_of
 from .focalplane import Focalplane
 from .log import Log
 from .numerics.random import stream_key
@@ -246,8 +246,8 @@ class Observation:
     boresight_radec: Floats
     centre: tuple[float, float]
     seed: int
-    flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
-    detector_flags: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    flags: Flags = field(default_factory=lambda: np.zeros(0, np.uint8))
+    detector_flags: Flags = field(default_factory=lambda: np.zeros(0, np.uint8))
     intervals: Intervals = field(default_factory=dict)
     weather: GroundWeather | None = None
     smooth: dict[str, SmoothField] = field(default_factory=dict)

@@ -32,7 +32,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from zonda.core.data import Block, Observation, Stream
@@ -41,7 +40,7 @@ from zonda.core.flags import DEAD
 from zonda.core.kernels import contracted
 from zonda.core.numerics.chunks import TILE_DETECTORS, TILE_SAMPLES, chunks
 from zonda.core.signal import MAIN
-from zonda.core.types import Bools, Floats
+from zonda.core.types import AnyFloats, Bools, Floats
 
 from .gram import NOTHING, Gram, Ritz, Usable, lanczos
 from .rows import LinearFilter
@@ -101,7 +100,7 @@ def read_mean(stream: Stream, use: Mask, good: Mask, inside: Inside | None = Non
 
     taking = np.zeros(n_samp)  # detectors outside of the mask
 
-    def look(detectors: slice, samples: slice, part: NDArray[np.floating]) -> tuple[Floats, ...]:
+    def look(detectors: slice, samples: slice, part: AnyFloats) -> tuple[Floats, ...]:
         rows, n = part.shape
         sums = np.zeros((-(-rows // TILE_DETECTORS), n))
         range_of = np.empty((2, n))

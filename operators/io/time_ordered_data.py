@@ -140,8 +140,8 @@ class TimeOrderedData:
     site: tuple[str, float, float, float]
     boresight_azel: Floats = field(default_factory=_none)
     boresight_radec: Floats = field(default_factory=_none)
-    flags: NDArray[np.uint8]
-    detector_flags: NDArray[np.uint8]
+    flags: Flags
+    detector_flags: Flags
     names: list[str]
     quats: Floats
     columns: dict[str, Floats]

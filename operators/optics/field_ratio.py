@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.numerics.chunks import chunks, empty
 from zonda.core.numerics.radiation import LEAST_TRANSMISSION
 from zonda.core.numerics.smooth import SmoothField, interpolating, spline_basis
-from zonda.core.types import Floats, Indices, Integers
+from zonda.core.types import AnyFloats, Floats, Indices, Integers
 
 AT_ONCE = 4096
 """Detectors whose series of the smooth fields are worked on at a time."""
@@ -65,7 +64,7 @@ def field_ratio(
         step //= 2
 
 
-def _representatives(weights: NDArray[np.floating], use: Indices) -> Indices:
+def _representatives(weights: AnyFloats, use: Indices) -> Indices:
     """Some hundreds of more than 512 detectors: evenly chosen, those at which a node weighs most
     and least, and some in ``use``.
     """

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.configuration.target import Target
 from zonda.core.configuration.time import Instant
 from zonda.core.data import Data, Observation
-from zonda.core.flags import SUN_CLOSE, SUN_UP, TURNAROUND, Intervals, intervals_of
+from zonda.core.flags import SUN_CLOSE, SUN_UP, TURNAROUND, Flags, Intervals, intervals_of
 from zonda.core.numerics.bodies import Track, tracks
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.chunks import chunks
@@ -49,7 +48,7 @@ def sunlit(
     seconds: Floats,
     azel: Floats,
     close: float = CLOSE,
-) -> tuple[NDArray[np.uint8], Intervals]:
+) -> tuple[Flags, Intervals]:
     """Flags (n,) and intervals of samples at ``seconds`` (n,) with boresights ``azel`` (n, 4).
 
     *sun_up*: the Sun's centre is above the horizon, without refraction; *sun_close*: it is within

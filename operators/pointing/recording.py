@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from zonda.core.configuration.time import Instant
 from zonda.core.errors import InputError
-from zonda.core.flags import EXCLUDE_SAMPLE, NOT_RECORDED, Intervals
+from zonda.core.flags import EXCLUDE_SAMPLE, NOT_RECORDED, Flags, Intervals
 from zonda.core.types import Bools, Floats, Indices, Integers
 
 UNEVEN = 0.25
@@ -56,7 +56,7 @@ class Recording:
     longitude: Floats
     latitude: Floats
     frame: Literal["azel", "icrs"]
-    flags: NDArray[np.uint8]
+    flags: Flags
     radec: Floats | None = None
     intervals: Intervals = field(default_factory=dict)
 
@@ -84,7 +84,7 @@ class Scan:
     rate: float
     longitude: Floats
     latitude: Floats
-    flags: NDArray[np.uint8]
+    flags: Flags
     radec: Floats | None = None
 
 

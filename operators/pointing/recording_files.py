@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from zonda.core import flags
 from zonda.core.configuration.time import SECOND, Instant
 from zonda.core.errors import InputError
-from zonda.core.flags import Intervals
+from zonda.core.flags import Flags, Intervals
 from zonda.core.storage import fits_files, hdf5_files
 from zonda.core.storage.files import reading
 from zonda.core.storage.table_files import Table, read_table, read_text
@@ -361,7 +361,7 @@ def _flags(
     bits: str,
     mask: int | None,
     trimmed: Bools,
-) -> NDArray[np.uint8]:
+) -> Flags:
     """Flags in bits of `core.flags`. A value that is not a number excludes the sample."""
     whole = np.where(np.isfinite(number), number, 255).astype(np.int64)
     if bits == "any":

@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 
 from zonda.core.errors import InputError
-from zonda.core.types import Bools, Floats, Integers
+from zonda.core.types import AnyFloats, Bools, Floats, Integers
 
 PIXELS_PER_FWHM = 4.0
 SMOOTH_BELOW = 2.0 - 1e-9
@@ -73,7 +73,7 @@ class Convolved:
         True where an axis has fewer than `SMOOTH_BELOW` pixels per FWHM.
     """
 
-    coefficients: dict[str, NDArray[np.floating]]
+    coefficients: dict[str, AnyFloats]
     to_grid: Floats
     bounds: Floats
     steps: tuple[int, int] = (1, 1)

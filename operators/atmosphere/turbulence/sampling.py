@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from zonda.core.data import Observation
 from zonda.core.errors import InputError
 from zonda.core.numerics.smooth import PAD, SPLINE_MARGIN, DetectorField, spline_coefficients
-from zonda.core.types import Floats
+from zonda.core.types import AnyFloats, Floats
 
 from .geometry import ScanPlane, rim
 from .lattice import Turbulence
@@ -94,7 +93,7 @@ class DriftingLayers:
         for own in sorted({step, *(layer.step for layer in drifting)}):
             low, high = (first, stop) if own == step else _coarse(first, stop, own // step)
             self.paths[own] = LinesOfSight(observation, plane, own, low, high - low)
-        self._constants: list[NDArray[np.floating]] = [
+        self._constants: list[AnyFloats] = [
             np.array([1 / 6, 2 / 3, 0.5, 1.0, layer.amplitude], dtype) for layer in drifting
         ]
         self._places = [_place(plane, layer, self.paths[layer.step].seconds) for layer in drifting]
