@@ -8,13 +8,12 @@ from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .errors import InputError
 from .flags import DEAD, EXCLUDE_DETECTOR, EXCLUDE_SAMPLE, Flags, Intervals, good, intervals_of
 from .focalplane import Focalplane
 from .log import Log
-from .numerics.random import stream_key
+from .numerics.random import Key, stream_key
 from .numerics.smooth import SmoothField
 from .tables import html_table
 from .types import AnyFloats, Bools, Floats, Indices, Integers
@@ -434,13 +433,13 @@ class Observation:
         held = {name: getattr(self, name) for name in each}
         return replace(self, **{name: x[at] for name, x in held.items() if x is not None})
 
-    def key(self, *names: str | int) -> NDArray[np.uint32]:
+    def key(self, *names: str | int) -> Key:
         """Random-stream key (2,) uint32 that belongs to this seed, this observation and
         ``names``.
         """
         return stream_key(self.seed, "observation", self.index, *names)
 
-    def detector_key(self, *names: str | int) -> NDArray[np.uint32]:
+    def detector_key(self, *names: str | int) -> Key:
         """Key of random numbers that belong to the detectors, such as noise and gains. Another
         instrument or another band has numbers of its own.
 
@@ -448,7 +447,7 @@ class Observation:
         """
         return self.key(*self.instrument.identity, *names)
 
-    def camera_key(self, *names: str | int) -> NDArray[np.uint32]:
+    def camera_key(self, *names: str | int) -> Key:
         """Key of random numbers of detectors that stay from scan to scan, such as time constants
         and sidelobes.
         """

@@ -46,9 +46,12 @@ _UNIFORMS = 1 << 30
 _LATTICE = 1 << 31
 _STREAMS = 1 << 32
 
+Key = NDArray[np.uint32]
+"""Key (2,) of a random stream."""
 
-def stream_key(seed: int, *names: str | int) -> NDArray[np.uint32]:
-    """Key (2,) uint32 of the random stream that belongs to ``seed`` and ``names``.
+
+def stream_key(seed: int, *names: str | int) -> Key:
+    """Key of the random stream that belongs to ``seed`` and ``names``.
 
     BLAKE2b over the type, length and content of each part, so no two different lists are encoded
     alike (``"ab", "c"`` and ``"a", "bc"``; ``1`` and ``"1"``).
@@ -66,7 +69,7 @@ def stream_key(seed: int, *names: str | int) -> NDArray[np.uint32]:
 
 
 def normals(
-    key: NDArray[np.uint32],
+    key: Key,
     start: int,
     stop: int,
     stream: int = 0,
@@ -84,7 +87,7 @@ def normals(
 
 
 def uniforms(
-    key: NDArray[np.uint32],
+    key: Key,
     start: int,
     stop: int,
     stream: int = 0,
@@ -99,7 +102,7 @@ def uniforms(
 
 
 def lattice_normals(
-    key: NDArray[np.uint32],
+    key: Key,
     i0: int,
     i1: int,
     j0: int,

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from zonda.core.kernels import contracted
 from zonda.core.numerics.chunks import TILE_DETECTORS
-from zonda.core.numerics.random import TILE, fill_normals, normal_scratch, normal_tile, normals
+from zonda.core.numerics.random import (
+    TILE,
+    Key,
+    fill_normals,
+    normal_scratch,
+    normal_tile,
+    normals,
+)
 from zonda.core.numerics.smooth import Series, SmoothField, series_into
 from zonda.core.types import AnyFloats, Floats
 
@@ -56,8 +63,8 @@ class Streams:
     def __init__(
         self,
         law: PowerLawFilter,
-        key: NDArray[np.uint32],
-        start_key: NDArray[np.uint32],
+        key: Key,
+        start_key: Key,
     ) -> None:
         self.law, self.key, self.start_key = law, key, start_key
         padding = (

@@ -7,7 +7,6 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numba import uint64
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, SerializeAsAny, WithJsonSchema, model_validator
 
 from zonda.core.configuration.units import Fraction, KelvinRootSecond
@@ -15,7 +14,7 @@ from zonda.core.data import Block, Data, Observation
 from zonda.core.errors import placed
 from zonda.core.focalplane import Focalplane
 from zonda.core.kernels import kernel
-from zonda.core.numerics.random import TILE, normal_scratch, normal_tile
+from zonda.core.numerics.random import TILE, Key, normal_scratch, normal_tile
 from zonda.core.numerics.smooth import series_into
 from zonda.core.operator import Operator
 from zonda.core.plausibility import NET, doubt
@@ -121,7 +120,7 @@ class WhiteNoise(Operator):
 
 class _State(NamedTuple):
     amplitude: Amplitude
-    key: NDArray[np.uint32]
+    key: Key
 
 
 @kernel

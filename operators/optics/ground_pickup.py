@@ -16,13 +16,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from zonda.core.configuration.parameters import quantity
 from zonda.core.configuration.units import Angle, Fraction, Kelvin
 from zonda.core.data import Block, Observation
-from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.random import Key, normals, stream_key
 from zonda.core.operator import Operator
 from zonda.core.signal import Component
 from zonda.core.types import Floats
@@ -82,7 +81,7 @@ class GroundPickup(Operator):
         stream += np.outer(gains[block.detectors], profile[block.samples]).astype(stream.dtype)
 
 
-def horizon(azimuth: Floats, fwhm: float, key: NDArray[np.uint32]) -> Floats:
+def horizon(azimuth: Floats, fwhm: float, key: Key) -> Floats:
     """The sum of equation (1) at ``azimuth`` (n,) [rad]: of unit variance over grounds, 0 on
     average over azimuths.
     """

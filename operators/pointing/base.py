@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from zonda.core.configuration.parameters import quantity
@@ -24,7 +23,7 @@ from zonda.core.instrument import Instrument
 from zonda.core.numerics.celestial import Boresight, CelestialTransform
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import series
-from zonda.core.numerics.random import normals, stream_key
+from zonda.core.numerics.random import Key, normals, stream_key
 from zonda.core.numerics.sphere import unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.scene import Scene
@@ -332,7 +331,7 @@ class Pointing(Scans):
 
         return make
 
-    def _jitter_key(self, data: Data, index: int) -> NDArray[np.uint32]:
+    def _jitter_key(self, data: Data, index: int) -> Key:
         return stream_key(data.scene.seed, self.label, "jitter", index)
 
     def _scan(
@@ -386,7 +385,7 @@ class Pointing(Scans):
         self.describe(observation)
         return observation
 
-    def _seconds(self, n: int, rate: float, key: NDArray[np.uint32]) -> Floats:
+    def _seconds(self, n: int, rate: float, key: Key) -> Floats:
         """When the samples are taken."""
         seconds = np.arange(n) / rate
         if self.jitter == 0:
