@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,8 @@ from numpy.typing import NDArray
 from .configuration.diagnostics import nearest
 from .errors import InputError
 from .focalplane import Focalplane
+from .storage.table_files import Table
 from .types import Bools, Floats, Indices, Integers
-
-if TYPE_CHECKING:
-    from .storage.table_files import Table
 
 QUANTITIES = {
     "xi": "rad",

@@ -12,7 +12,8 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from pathlib import Path
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic_core import PydanticCustomError
@@ -20,15 +21,11 @@ from pydantic_core import PydanticCustomError
 from .accuracy.metrics import Metric, OfFunction, get
 from .configuration.diagnostics import TextValue, mistake, refusal
 from .configuration.parameters import Parameters
+from .data import Data
 from .errors import InputError, PipelineError, ZondaError
 from .signal import Signal
 from .tables import Table, html_table
 from .types import Floats
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from .data import Data
 
 
 @dataclass(frozen=True)

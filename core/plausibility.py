@@ -8,12 +8,9 @@ steps use `doubt`, too.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from .band import SPEED_OF_LIGHT
-
-if TYPE_CHECKING:
-    from .instrument import Instrument
+from .instrument import Instrument
 
 NET = 1e-6, 3.0
 """K_RJ s^1/2, on the sky."""

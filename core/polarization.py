@@ -22,7 +22,7 @@ as in TOAST (`StokesWeights`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +30,8 @@ from numpy.typing import NDArray
 from .kernels import kernel
 from .numerics.projection import rotation_matrices
 from .numerics.quaternions import detector_quaternions
+from .observation import Observation
 from .types import AnyFloats, Floats, Indices
-
-if TYPE_CHECKING:
-    from .observation import Observation
 
 AT_ONCE = 512
 """Samples whose angles are in the first cache together."""

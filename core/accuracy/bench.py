@@ -26,20 +26,17 @@ from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ..data import Data
 from ..errors import InputError, ZondaError
+from ..experiment.engines import Pool
 from ..experiment.variant import FileVariant
 from ..faults import faults_named
 from .metrics import Metric, metric_of
 from .settings import Setting, overrides
-
-if TYPE_CHECKING:
-    from ..data import Data
-    from ..experiment.engines import Pool
-
 
 REST = "(rest)"
 """CPU seconds that no operator's stage accounts for."""

@@ -13,26 +13,22 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from ..configuration.pipeline_file import PipelineFile
+from ..data import Data
 from ..errors import InputError
 from ..experiment.variant import FileVariant
+from ..operator import Operator
 from ..output import Output
 from ..plan.planning import planning_of
 from ..storage.files import write_text
 from .metrics import get, metric_of
-from .pareto import Point, cheapest
+from .pareto import Point, Study, cheapest
 from .settings import LENGTH, Setting, knobs_of, overrides
 from .sweep import tightest
-
-if TYPE_CHECKING:
-    from ..configuration.pipeline_file import PipelineFile
-    from ..data import Data
-    from ..operator import Operator
-    from .pareto import Study
-
 
 FORMAT = 2
 """1: ``reference_error`` without the knobs that stay as in the file."""

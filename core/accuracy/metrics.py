@@ -9,21 +9,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from .. import registry
 from ..configuration import yaml_places
 from ..configuration.parameters import Parameters
+from ..configuration.pipeline_file import PipelineFile
+from ..data import Data
 from ..errors import InputError, PipelineError
+from ..operator import Operator
+from ..signal import Signal
 from ..types import Floats
-
-if TYPE_CHECKING:
-    from ..configuration.pipeline_file import PipelineFile
-    from ..data import Data
-    from ..operator import Operator
-    from ..signal import Signal
 
 
 class Metric:

@@ -18,18 +18,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
+from ..configuration.pipeline_file import PipelineFile
 from ..errors import InputError
+from ..experiment.engines import Pool
 from .bench import BETWEEN, REFERENCE_RUNS, Bench, Run, Setup, TimedRun, run_in
 from .metrics import metric_of
 from .settings import PipelineKnob, Setting
 from .sweep import Alone, Sweep, sweep, tightest
-
-if TYPE_CHECKING:
-    from ..configuration.pipeline_file import PipelineFile
-    from ..experiment.engines import Pool
-
 
 JOINT = 40
 """Joint settings at the most."""

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..configuration import yaml_places
 from ..configuration.diagnostics import nearest
+from ..configuration.pipeline_file import PipelineFile
 from ..errors import InputError
+from ..operator import Operator
 from ..plan.planning import PRECISION, Knob, planning_of
-
-if TYPE_CHECKING:
-    from ..configuration.pipeline_file import PipelineFile
-    from ..operator import Operator
 
 Setting = dict[str, str]
 """Values by key, both as ``--set`` takes them: {"PinkNoise.poles": "8"}."""

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING
 
 from ..data import Data
 from ..errors import ZondaError
@@ -15,10 +14,8 @@ from ..operator import Operator
 from ..output import may_write
 from ..pipeline import Pipeline
 from ..plausibility import doubts
+from ..scene import Scene
 from ..signal import is_stream
-
-if TYPE_CHECKING:
-    from ..scene import Scene
 
 
 def run_checks(pipeline: Pipeline, scene: Scene, *, saved: bool = True) -> list[list[str]]:

@@ -11,18 +11,16 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..accuracy.metrics import Metric
 from ..configuration.input_paths import paths_in
+from ..configuration.pipeline_file import PipelineFile
+from ..data import Data
+from ..operator import Operator
 from ..output import Output
 from ..pipeline import Part, Pipeline
 from ..scene import Scene
-
-if TYPE_CHECKING:
-    from ..accuracy.metrics import Metric
-    from ..configuration.pipeline_file import PipelineFile
-    from ..data import Data
-    from ..operator import Operator
 
 
 @dataclass(frozen=True, eq=False)

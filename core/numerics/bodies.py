@@ -11,17 +11,15 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ..configuration.target import Target
+from ..site import Site
 from ..types import Floats
 from .celestial import orientation
 from .sphere import unit_vectors
-
-if TYPE_CHECKING:
-    from ..configuration.target import Target
-    from ..site import Site
 
 PLANETS = {
     "mercury": 1,

@@ -32,19 +32,17 @@ import os
 import warnings
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from ..configuration.time import Instant
 from ..errors import PointingError
+from ..site import Site
 from ..types import Floats
 from .chunks import chunks
 from .projection import rotation_matrices
 from .quaternions import Upright, conjugate, multiply, rotate, series, shortest_rotation
-
-if TYPE_CHECKING:
-    from ..configuration.time import Instant
-    from ..site import Site
 
 SIDEREAL_RATE = 2 * np.pi * 1.00273781191135448 / 86400
 """Rate of the Earth rotation angle, rad/s of UT1."""

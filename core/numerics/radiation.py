@@ -14,17 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..band import SPEED_OF_LIGHT
+from ..band import SPEED_OF_LIGHT, Band
 from ..errors import InputError
 from ..types import Floats
-
-if TYPE_CHECKING:
-    from ..band import Band
 
 PLANCK = 6.62607015e-34
 """J s (SI, exact)."""

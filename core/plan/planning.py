@@ -6,19 +6,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
 
 from pydantic import BaseModel, TypeAdapter
 
+from ..data import Data, Observation
 from ..function_operator import FunctionOperator
 from ..mapmaker import filters
 from ..operator import Operator
 from ..registry import RegistryError, planning
-from .bounds import Cost, Estimate, Traits
-
-if TYPE_CHECKING:
-    from ..data import Data, Observation
-    from .bounds import Context
+from .bounds import Context, Cost, Estimate, Traits
 
 
 @dataclass(frozen=True)
