@@ -269,12 +269,11 @@ def leading_of(
 
 def with_gradients(rows: Floats, known: Floats, places: Floats, number: int, free: int) -> Floats:
     """Vectors (at most ``number``, n_det) that lead ``rows`` (n_det, n), of which the first are
-    ``known``: at least the leading one u. Of u x and u y of the detectors' ``places`` (2, n_det),
-    which long waves of the atmosphere make, those that are not among them come next: leading
-    vectors that are found in the noise of the streams miss these by so much that the atmosphere
-    stays in the map. Before them come further leading vectors, as long as those of one half of the
-    columns hold more of the others. Where one of the two alone is ``free``, or has room, it is that
-    along which rows change most.
+    ``known``. Of u x and u y, u the leading vector and ``places`` (2, n_det) the detectors', which
+    long waves of the atmosphere make, those that are not among the known ones come next, unless
+    leading vectors of one half of the columns hold more of the others: these miss them by so much
+    that the atmosphere stays in the map. A free vector may then come before them. Where one of the
+    two alone is ``free``, or has room, it is that along which rows change most.
     """
     found = known if len(known) else leading(rows, 1, known)
     middle = (found[:1] ** 2 * places).sum(axis=1, keepdims=True)
@@ -294,8 +293,10 @@ def with_gradients(rows: Floats, known: Floats, places: Floats, number: int, fre
         power = [(np.einsum("kd,dt->kt", v, rows[:, 1::2]) ** 2).sum() for v in (slopes, others)]
         if power[0] > power[1]:
             return np.concatenate([found, slopes])
+        if len(found) >= free:
+            break
         found = leading(rows, len(found) + 1, found)
-    return found
+    return found if len(found) > max(len(known), 1) else known
 
 
 def filled(
