@@ -129,6 +129,14 @@ class CompressedScan:
         _lower(self.first, self.pixel, self.samples, self.counted, self.n_pixels, a, y, steps)
         return np.asarray(s + np.cumsum(steps, axis=1)[:, :-1])
 
+    def over(self, c: Floats) -> Floats:
+        """(n_det, n_base) sums of a stream (n_samp,) over the samples of each detector that are
+        there.
+        """
+        running, out = np.concatenate([[0.0], np.cumsum(c)]), np.zeros(self.shape)
+        _over(self.first, self.pixel, self.samples, self.n_pixels, running, out)
+        return out
+
     def weigh(self, weight: Floats, out: Floats) -> None:
         """Add each detector's ``weight`` (n_det,) at its samples to the weights ``out`` (1 or 6,
         width) of I, or of I, Q and U: ii, iq, iu, qq, qu, uu.
@@ -501,6 +509,20 @@ def _spread(  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _over(first, pixel, samples, nowhere, running, out):  # type: ignore[no-untyped-def]
+    """Sums over samples in pixels of the map, of running sums (n_samp + 1,)."""
+    n_det, n_base = out.shape
+    for d in range(n_det):
+        t = 0
+        for b in range(n_base):
+            for r in range(first[d * n_base + b], first[d * n_base + b + 1]):
+                then = t + samples[r]
+                if pixel[r] < nowhere:
+                    out[d, b] += running[then] - running[t]
+                t = then
+
+
+@kernel
 def _lower(first, pixel, samples, counted, nowhere, a, y, steps):  # type: ignore[no-untyped-def]
     """Take the means y of baselines off s, as steps."""
     n_det, n_base = counted.shape
@@ -535,6 +557,18 @@ def _weigh(first, pixel, samples, angles, counted, weight, out):  # type: ignore
                     out[3, p] += n * c * c
                     out[4, p] += n * c * s
                     out[5, p] += n * s * s
+
+
+@kernel
+def add_groups(signal, pixel, groups, scale, out):  # type: ignore[no-untyped-def]
+    """Add the samples of a tile to fixed-point sums (n_groups, n) over detectors; ``pixel`` as in
+    `Tile.of`.
+    """
+    for d in range(pixel.shape[0]):
+        total = out[groups[d]]
+        for i in range(pixel.shape[1]):
+            if pixel[d, i] >= 0:
+                total[i] += np.int64(np.rint(signal[d, i] * scale))
 
 
 @kernel

@@ -19,7 +19,7 @@ from zonda.core.types import AnyFloats, Floats
 from .baseline_noise import BaselineNoise, estimate, filled, members
 from .bin_map import Prepared
 from .binning import Weights, binnings
-from .compressed_scan import RunsOfTiles, Tile, add_baselines
+from .compressed_scan import RunsOfTiles, Tile, add_baselines, add_groups
 from .intensity_kernel import VALUE, WEIGHT
 from .normal_equations import Compressed
 from .parameters import LikelihoodParameters
@@ -28,6 +28,8 @@ from .stated_noise import of_scene, of_table
 if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable
 
+STEPS = 3
+"""Of the search for what detectors have in common within baselines of which samples lack."""
 FILLED, STILL = 60, 1e-6
 """Searches at most for the mode that fills baselines, and the change below which they end."""
 MOST_APART = 1e4
@@ -94,8 +96,10 @@ class BandScan:
 
     def tiles(
         self, detectors: slice, samples: slice, part: AnyFloats, mean: Any, nowhere: int
-    ) -> Iterator[tuple[NDArray[np.intp], Tile]]:
-        """Rows in the scan, and runs, of a block of the stream, tile after tile."""
+    ) -> Iterator[tuple[NDArray[np.intp], Tile, int, NDArray[np.int64]]]:
+        """Rows in the scan, runs, first sample, and sum over detectors of each group (n_groups, n),
+        of a block of the stream, tile after tile.
+        """
         begin = max(detectors.start, self.of_stream.start)
         end = min(detectors.stop, self.of_stream.stop)
         place = self.of_stream.start + self.rows
@@ -119,7 +123,10 @@ class BandScan:
                 sine *= efficiency
             pixel, single = self.pixels(which, start, stop, signal), observation.hwp_angle
             each = cosine, sine, single is not None
-            yield rows, Tile.of(signal, pixel, start, self.scan.length, nowhere, *each)
+            tile = Tile.of(signal, pixel, start, self.scan.length, nowhere, *each)
+            total = np.zeros((len(self.scan.total), stop - start), np.int64)
+            add_groups(signal, pixel, self.scan.groups[rows], VALUE, total)
+            yield rows, tile, start, total
 
     def weigh(self, white: Floats) -> Floats:
         """Weigh detectors by the white level (n,) that was found: empty sums in pixels. Returns the
@@ -178,6 +185,8 @@ class LikelihoodScan:
         With the detectors of all bands.
     rows
         (n,) the good detectors.
+    groups, total
+        (n,) of each, and the sum over the detectors of each group (n_groups, n_samp), fixed-point.
     baselines, common
         By signal, fixed-point sums of baselines (n, n_base) and free modes (free, n_samp).
     """
@@ -186,6 +195,8 @@ class LikelihoodScan:
     length: int
     observation: Observation
     rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    groups: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    total: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     baselines: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     common: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     found: Any = None
@@ -193,7 +204,7 @@ class LikelihoodScan:
     filler: Any = None
     noise: Any = None
 
-    def compress(self, stream: Stream, place: str) -> None:
+    def compress(self, stream: Stream, step: LikelihoodParameters) -> None:
         """Find runs and baselines of the complete signal, in one reading."""
         row, found, nowhere = 0, list[NDArray[np.intp]](), 0
         for band in self.bands:
@@ -202,7 +213,7 @@ class LikelihoodScan:
             if not band.rows.size:
                 raise PipelineError(
                     "no detector is good",
-                    place=f"{place}, {own.name}",
+                    place=f"{step.label}, {own.name}",
                     cure="leave this scan out, or look at the flags of its detectors",
                 )
             before = sum(rows.size for rows in found)
@@ -212,15 +223,43 @@ class LikelihoodScan:
             row, nowhere = band.of_stream.stop, nowhere + int(band.looking.grid.n_pixels)
         self.rows, mean = np.concatenate(found), stream.means.get(MAIN)
         self.found = RunsOfTiles(self.rows.size, self.observation.n_samples, self.length)
+        groups = np.unique(step.groups_of(self.observation)[self.rows], return_inverse=True)
+        self.groups = np.asarray(groups[1], np.intp)
+        self.total = np.zeros((len(groups[0]), self.observation.n_samples), np.int64)
 
         def tiles(detectors: slice, samples: slice, part: AnyFloats) -> list[Any]:
             block = detectors, samples, part, mean, nowhere
             return [tile for band in self.bands for tile in band.tiles(*block)]
 
         for _, _, made in stream.sweep(tiles):
-            for rows, tile in made:
+            for rows, tile, start, total in made:
                 self.found.add(rows, tile)
+                self.total[:, start : start + total.shape[1]] += total
         self.scan = self.found.scan(self.observation.sample_rate, nowhere)
+
+    def steady(self, white: Floats) -> Floats:
+        """(n, n_base) means of baselines, K. Where samples of some detectors lack, without what the
+        part that detectors of a group have in common, with the gains of the mode that `filler` is,
+        differs in the others from its mean over the baseline.
+        """
+        scan, y, gain = self.scan, self.found.means, self.filler * np.sqrt(white)
+        starts = np.arange(scan.shape[1]) * self.length
+        for _ in range(STEPS if scan.gaps else 0):
+            lost = np.zeros(scan.shape)
+            for group, total in enumerate(self.total / VALUE):
+                share = (self.groups == group).astype(np.float64)
+                own = share * gain
+                own *= share.sum() / own.sum() if own.any() else 0.0
+                one = np.ones(scan.shape)
+                there = scan.about_means(np.zeros((1, scan.n_samples)), -one, own[None])
+                c = scan.about_means(total[None], y, share[None])
+                c = np.divide(c, there, out=np.zeros_like(c), where=there > 0)[0]
+                number = np.add.reduceat(there[0] > 0, starts, dtype=np.float64)
+                whole = np.add.reduceat(c, starts) / np.maximum(number, 1)
+                some = scan.over(c) / np.maximum(scan.known, 1)
+                lost += own[:, None] * np.where(scan.known > 0, some - whole, 0.0)
+            y = self.found.means - lost
+        return np.asarray(y)
 
     def name(self, k: int) -> str:
         """The name of a good detector."""
@@ -254,10 +293,10 @@ class LikelihoodScan:
         what all see alike, then by the first mode that is found: a fit of more is not stable.
         """
         lacking, self.filler = self.scan.lacking, np.sqrt(1 / white / (1 / white).sum())
-        groups, plane = step.groups_of(self.observation)[self.rows], self.observation.focalplane
+        groups, plane = self.groups, self.observation.focalplane
         for _ in range(FILLED):
             noise = estimate(
-                filled(self.found.means, lacking, white, self.filler, step.trend, groups),
+                filled(self.steady(white), lacking, white, self.filler, step.trend, groups),
                 self.scan.counted,
                 white,
                 self.length,
@@ -273,9 +312,13 @@ class LikelihoodScan:
             with_modes = [at for at in members(groups) if noise.modes[:, at].any()]
             if with_modes:
                 self.filler = noise.modes[: len(with_modes)].sum(axis=0)
-            if not lacking.any() or np.abs(self.filler - before).max() < STILL:
+            if not self.scan.gaps or np.abs(self.filler - before).max() < STILL:
                 break
-        return noise
+        known = np.where(self.scan.known > 0, self.scan.known, np.inf)
+        fewer = (self.scan.counted / known).sum(axis=1) / np.maximum(
+            (known < np.inf).sum(axis=1), 1
+        )
+        return replace(noise, fast=noise.fast / np.maximum(fewer, 1))
 
     def state_noise(self, step: LikelihoodParameters, table: NoiseTable | None) -> None:
         """Take the noise from a table, or from the scene.

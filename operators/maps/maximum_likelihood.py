@@ -152,7 +152,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
             flags = [band.observation.flags for band in bands]
             observation.flags = np.bitwise_and.reduce(flags)
         scan = LikelihoodScan(bands, self._length(observation), observation)
-        scan.compress(stream, self.label)
+        scan.compress(stream, self)
         white = scan.white(self.label)
         place = f"{self.label}, {observation.name}"
         number = int(np.count_nonzero(scan.found.counted.any(axis=0)))
