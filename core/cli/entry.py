@@ -133,7 +133,7 @@ def main(arguments: list[str] | None = None) -> int:
         except ZondaError as err:
             _report(err)
         except (Interrupted, KeyboardInterrupt, click.Abort) as err:
-            _clear()
+            clear_line()
             with contextlib.suppress(OSError):  # the terminal may be gone
                 click.echo("interrupted: unfinished files were removed", err=True)
             return int(getattr(err, "status", INTERRUPTED))
@@ -157,7 +157,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _report(err: ZondaError) -> None:
     colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
-    _clear()
+    clear_line()
     if render := getattr(err, "render", None):
         text = render(colour)
     else:
@@ -165,7 +165,7 @@ def _report(err: ZondaError) -> None:
     click.echo(text.encode(errors="backslashreplace").decode(), err=True)  # names that are no UTF-8
 
 
-def _clear() -> None:
+def clear_line() -> None:
     """Clear the line that a progress plugin may have left."""
     if sys.stderr.isatty():
         click.echo("\r\033[K", nl=False, err=True)

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from zonda.core.cli.entry import clear_line
+
 if TYPE_CHECKING:
     from .claims import Claim
     from .rows import Row
@@ -76,7 +78,7 @@ def validate(
     with lock(output):
         rows = measured(chosen, output, path.parent, _say)
         write(file, rows, output)
-    _clear()
+    clear_line()
     click.echo("\n".join(aligned(map(_cells, rows), align="<<><><")))
     click.echo(f"\n{summary(rows)}\n{output}/claims.html")
     return 0 if all(row.verdict.decided for row in rows) else UNDECIDED
@@ -111,8 +113,3 @@ def _say(text: str) -> None:
     """On a terminal one line that is written over; in a log a line each."""
     terminal = sys.stderr.isatty()
     click.echo(f"\r\033[K{text[:120]}" if terminal else text, nl=not terminal, err=True)
-
-
-def _clear() -> None:
-    if sys.stderr.isatty():
-        click.echo("\r\033[K", nl=False, err=True)
