@@ -93,7 +93,7 @@ class Scan:
         data = zonda.Pipeline(
             [*steps, zonda.SaveTOD(), map_makers.Maker(**how)], runs=map_makers.SIGNALS
         ).run(scene, threads=1, keep=["signal", "signal/rest"], output=folder)
-        equations, solution, *_ = map_makers.KEPT
+        equations, _, solution, *_ = map_makers.KEPT[0]
         ((scan, _),) = equations.scans
         pixel = np.repeat(scan.pixel, scan.samples).reshape(scan.shape[0], scan.n_samples)
         pixel[pixel == equations.n_pixels] = -1
