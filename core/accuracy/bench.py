@@ -14,7 +14,6 @@ programs put on the machine.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import gc
 import math
 import os
@@ -35,6 +34,7 @@ from ..errors import InputError, ZondaError
 from ..experiment.engines import Pool
 from ..experiment.variant import FileVariant
 from ..faults import faults_named
+from ..machine import give_back_memory
 from .metrics import Metric, metric_of
 from .settings import Setting, overrides
 
@@ -146,8 +146,7 @@ def by_step(data: Data, used: float) -> dict[str, float]:
 def reset_peak_memory() -> None:
     """Give back free memory and forget the peak so far, where the system can (Linux)."""
     gc.collect()
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
+    give_back_memory()
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 

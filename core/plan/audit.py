@@ -115,11 +115,6 @@ class Checked:
         return "VIOLATED" if self.violated else "holds" if self.exercised else "not exercised"
 
     @property
-    def idle(self) -> bool:
-        """True if the audit says nothing about the bound."""
-        return not self.exercised
-
-    @property
     def violated(self) -> bool:
         """True if the bound, or the prediction, does not hold."""
         if self.within is not None:
@@ -151,7 +146,8 @@ class Audit:
         lines = [f"audit of {self.slice}", *aligned(table, head)]
         if all(r.within is not None for r in self.rows):
             lines.append(nothing)
-        count, idle = (sum(getattr(r, k) for r in self.rows) for k in ("violated", "idle"))
+        count = sum(r.violated for r in self.rows)
+        idle = sum(not r.exercised for r in self.rows)
         words = f", {idle} not exercised" if idle else ""
         return "\n".join([*lines, f"{len(self.rows)} bounds, {count} violated{words}"])
 
