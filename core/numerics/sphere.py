@@ -5,6 +5,7 @@ of longitudes and latitudes, and back. All angles in rad.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,12 @@ def angles(vectors: Floats) -> tuple[Floats, Floats]:
     """(longitude, latitude) of directions (..., 3); the longitude from -pi to pi."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+
+
+def position(direction: Iterable[float]) -> tuple[float, float]:
+    """(longitude, latitude) of one direction; the longitude from 0 to 2 pi."""
+    x, y, z = map(float, direction)
+    return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
 
 
 def local_axes(longitude: float, latitude: float) -> Floats:

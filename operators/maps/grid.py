@@ -30,6 +30,7 @@ from zonda.core.numerics.projection import (
     pixel_matrix,
     ray_coefficients,
 )
+from zonda.core.numerics.sphere import position
 from zonda.core.observation import Observation
 from zonda.core.types import Floats
 
@@ -257,12 +258,8 @@ def in_frame(icrs: tuple[float, float], frame: str) -> tuple[float, float]:
     ra, dec = icrs
     if frame == "icrs":
         return ra, dec
-    x, y, z = frame_rotation(frame) @ [
-        math.cos(dec) * math.cos(ra),
-        math.cos(dec) * math.sin(ra),
-        math.sin(dec),
-    ]
-    return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
+    ray = [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+    return position(frame_rotation(frame) @ ray)
 
 
 def covering_extent(

@@ -18,7 +18,7 @@ import numpy as np
 
 from zonda.core.data import Observation
 from zonda.core.errors import InputError, PipelineError
-from zonda.core.numerics.sphere import ARCSEC, local_axes, unit_vectors
+from zonda.core.numerics.sphere import ARCSEC, local_axes, position, unit_vectors
 from zonda.core.types import Floats
 
 from .grid import (
@@ -60,7 +60,7 @@ def whole_of(fields: Sequence[Sequence[float]], place: str) -> tuple[float, floa
         direction = axes.T @ [1.0, (x.min() + x.max()) / 2, (y.min() + y.max()) / 2]
     axes = _axes(direction)
     x, y = _projected(corners, axes, place)
-    longitude, latitude = _position(axes[0])
+    longitude, latitude = position(axes[0])
     return longitude, latitude, float(abs(x).max()), float(abs(y).max())
 
 
@@ -71,13 +71,8 @@ def _corners(longitude: float, latitude: float, width: float, height: float) -> 
     return np.asarray(corners / np.linalg.norm(corners, axis=1)[:, None])
 
 
-def _position(direction: Floats) -> tuple[float, float]:
-    x, y, z = (float(v) for v in direction)
-    return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
-
-
 def _axes(direction: Floats) -> Floats:
-    return local_axes(*_position(direction))
+    return local_axes(*position(direction))
 
 
 def _projected(corners: Floats, axes: Floats, place: str) -> Floats:

@@ -21,7 +21,7 @@ from zonda.core.numerics.bodies import Track, tracks
 from zonda.core.numerics.celestial import CelestialTransform
 from zonda.core.numerics.chunks import chunks
 from zonda.core.numerics.quaternions import directions
-from zonda.core.numerics.sphere import unit_vectors
+from zonda.core.numerics.sphere import position, unit_vectors
 from zonda.core.operator import Operator
 from zonda.core.plots import plot_scans
 from zonda.core.scene import Scene
@@ -178,8 +178,8 @@ def centre_of(
     if target.frame != "horizontal":
         return target.icrs()
     middle = np.array([(seconds[0] + seconds[-1]) / 2])
-    x, y, z = transform.icrs(unit_vectors([-target.longitude], [target.latitude]), middle)[0]
-    return math.atan2(y, x) % (2 * math.pi), math.atan2(z, math.hypot(x, y))
+    ray = unit_vectors([-target.longitude], [target.latitude])
+    return position(transform.icrs(ray, middle)[0])
 
 
 def mark_turnarounds(
