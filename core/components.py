@@ -77,13 +77,11 @@ class Registry:
         classes: bool = False,
         exact: bool = False,
     ) -> None:
-        self.kind, self.groups, self.base, self.classes, self.exact = (
-            kind,
-            groups.split(),
-            base,
-            classes,
-            exact,
-        )
+        self.kind = kind
+        self.groups = groups.split()
+        self.base = base
+        self.classes = classes
+        self.exact = exact
         self._found: dict[str, list[Found]] | None = None
         self._loaded: dict[Found, Any] = {}
         self._session: dict[str, Found] = {}
@@ -327,7 +325,8 @@ class Registry:
                 cure=f"pip install -U {found.distribution if older else 'zonda'}",
             )
         if self.base and (made or self.classes or not callable(component)):
-            base, attribute = self._class, self._class.__name__
+            base = self._class
+            attribute = self._class.__name__
             if not (
                 isinstance(component, type) and issubclass(component, base)
                 if self.classes

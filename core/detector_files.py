@@ -29,7 +29,8 @@ from .types import Floats
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 """Begins every HDF5 file."""
-TOAST, HARDWARE = "a focal plane of TOAST", "hardware of sotodlib"
+TOAST = "a focal plane of TOAST"
+HARDWARE = "hardware of sotodlib"
 TOAST_CURE = "write it with toast: focalplane.save_hdf5(h5py.File(path, 'w'))"
 HARDWARE_CURE = "write it with sotodlib: Hardware.dump(path), after detectors were simulated"
 UNITS = {
@@ -123,7 +124,8 @@ def _of_hardware(path: Path, place: str) -> tuple[Table, list[str]]:
         found = tomllib.loads(unpacked(path, place, LARGEST).decode())
         if not found.get("detectors"):
             raise KeyError("there are no detectors")
-        detectors, bands = dict(found["detectors"]), dict(found.get("bands", {}))
+        detectors = dict(found["detectors"])
+        bands = dict(found.get("bands", {}))
     columns: dict[str, Any] = {key: [] for key in ("name", "band", "wafer", "quaternion")}
     columns |= {key: [] for key in OF_HARDWARE}
     for name, own in detectors.items():
@@ -217,7 +219,8 @@ def _convert_net(numbers: dict[str, Any], notes: list[str]) -> None:
         notes.append("NETs are not used: without a band they cannot be turned into K_RJ")
         return
     x, weight = np.polynomial.legendre.leggauss(16)
-    low, high = numbers["low"][:, None], numbers["high"][:, None]
+    low = numbers["low"][:, None]
+    high = numbers["high"][:, None]
     slope = cmb_slope(low + (high - low) * (1 + x) / 2) @ weight / 2
     numbers["net"] = numbers["net"] * slope * numbers.get("correction", 1.0)
     by = ", times NET_corr," if "correction" in numbers else ""
@@ -261,7 +264,8 @@ def read_noise(path: Path) -> NoiseTable:
 
 def _read(path: Path) -> NoiseTable:
     table = read_table(path, f"noise table {path}")
-    names, columns = table.texts("name"), {}
+    names = table.texts("name")
+    columns = {}
     for name, otherwise in (("net", np.nan), ("knee", 0.0), ("slope", 1.0)):
         if any(table.texts(name)):
             unit = UNITS[name]

@@ -23,7 +23,9 @@ class ZondaError(Exception):
 
     def __init__(self, message: str, *, place: str = "", cure: str = "") -> None:
         super().__init__(message)
-        self.message, self.place, self.cure = message, place, cure
+        self.message = message
+        self.place = place
+        self.cure = cure
 
     def __str__(self) -> str:
         text = f"{self.place}: {self.message}" if self.place else self.message

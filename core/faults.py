@@ -56,24 +56,30 @@ def fault(err: BaseException) -> PluginError | None:
 
     A plugin's own command is not zonda's to judge: it is called by click, not by zonda.
     """
-    step, called, last, innermost = None, None, None, None
+    step = None
+    called = None
+    last = None
+    innermost = None
     zonda = False
     for frame, line in traceback.walk_tb(err.__traceback__):
         root = _root(frame)
         step = _step(frame) or step
         if root == HOST:
-            zonda, innermost = True, None
+            zonda = True
+            innermost = None
         elif called is None and root == "click":
             zonda = False
         elif zonda and _is_plugin(frame):
-            called, last = called or frame, (frame, line)
+            called = called or frame
+            last = (frame, line)
         elif zonda and root not in sys.stdlib_module_names:
             innermost = (frame, line)
     if called is None and innermost is not None and not isinstance(err, Exception):
         called, last = innermost[0], innermost  # whoever ends the program, in a notebook, too
     if called is None or last is None:
         return None
-    module, name = str(called.f_globals.get("__name__", "")), called.f_code.co_qualname
+    module = str(called.f_globals.get("__name__", ""))
+    name = called.f_code.co_qualname
     where = f"{last[0].f_code.co_filename}, line {last[1]}"
     words = str(err).strip().splitlines()[:1]
     what = ": ".join([type(err).__name__, *words])

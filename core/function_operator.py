@@ -45,11 +45,13 @@ class FunctionOperator(Operator):
 
         Raises PipelineError as `exec` does.
         """
-        observation, fixed = stream.observation, None
+        observation = stream.observation
+        fixed = None
         if stream.name == EMISSION:
             fixed = observation.smooth.get(EMISSION)
         name, (n_det, n_samp) = stream.name, stream.shape
-        values, every = whole(stream, fixed), (slice(0, n_det), slice(0, n_samp))
+        values = whole(stream, fixed)
+        every = (slice(0, n_det), slice(0, n_samp))
         block = Block(
             observation, *every, {name: values}, dtype=np.float64, components=stream.components
         )
@@ -114,8 +116,10 @@ class FunctionOperator(Operator):
         self._idle = self._idle is not False and made is None and before == bits()
         if made is None:
             return
-        values, only = np.asarray(made), len(self.provides) == 1
-        numbers, name = values.dtype.kind in "fiu", next(iter(self.provides), "")
+        values = np.asarray(made)
+        only = len(self.provides) == 1
+        numbers = values.dtype.kind in "fiu"
+        name = next(iter(self.provides), "")
         if not only or not numbers or values.shape != block.shape:
             what = f"an array of shape {values.shape}" if numbers else f"{made!r:.40}"
             wanted = f", or the stream {name}, an array of shape {block.shape}"

@@ -98,11 +98,9 @@ class Pipeline:
         precision: Literal["float32", "float64"] = "float32",
     ) -> None:
         self.operators = arguments.steps(operators, name)  # copies: labels are this pipeline's own
-        self.name, self.description, self.precision = (
-            name,
-            description,
-            arguments.precision(precision, name),
-        )
+        self.name = name
+        self.description = description
+        self.precision = arguments.precision(precision, name)
         self.only = tuple(arguments.components(only, name))
         for operator, label in zip(self.operators, labels(self.operators), strict=True):
             operator._label = label
@@ -177,7 +175,8 @@ class Pipeline:
                 check_output_folder(data.output)
                 inputs = paths_in([scene, *self.operators])
                 stack.enter_context(recording(data.output, anew=True, inputs=inputs))
-            hooks, timer = manager().hook, Timer()
+            hooks = manager().hook
+            timer = Timer()
             hooks.zonda_pipeline_start(pipeline=self, data=data)
             for operator in self.operators:
                 timer.add(operator.label, "observe", 0.0)  # rows in the order of the steps
@@ -431,7 +430,8 @@ class Pipeline:
         data: Data | list[Data],
     ) -> None:
         """Call an operator with all data and time it; hooks are called around ``finalize``."""
-        hooks, stage = manager().hook, method.removesuffix("_bands")
+        hooks = manager().hook
+        stage = method.removesuffix("_bands")
         if stage == "finalize":
             hooks.zonda_before_operator(operator=operator, observation=None, stage=stage)
         start = time.thread_time()

@@ -54,7 +54,8 @@ def doubts(instrument: Instrument) -> list[str]:
         )
     ]
     for name, camera in instrument.cameras.items():
-        centre, who = camera.band.centre, f"{instrument.name}, {name}"
+        centre = camera.band.centre
+        who = f"{instrument.name}, {name}"
         found.append(
             doubt(f"{who}: the band's centre", centre / 1e9, (BAND[0] / 1e9, BAND[1] / 1e9), "GHz")
         )

@@ -60,7 +60,8 @@ def _middle(plane: Focalplane) -> tuple[tuple[float, float], float]:
     """
     first = int(np.argmin(np.hypot(plane.xi, plane.eta)))
     own = np.flatnonzero((plane.band == plane.band[first]) & (plane.wafer == plane.wafer[first]))
-    x, y = plane.xi[own], plane.eta[own]
+    x = plane.xi[own]
+    y = plane.eta[own]
     middle = int(np.argmin(np.hypot(x - x.mean(), y - y.mean())))
     centre = float(x[middle]), float(y[middle])
     places = np.unique(np.stack([x, y], axis=1).round(12), axis=0)
@@ -85,7 +86,8 @@ def _draw(
     for k, band in enumerate(instrument.cameras):
         own = plane.band == k if instrument.bands else np.ones(len(plane), bool)
         rows = np.flatnonzero(near & own)
-        colour, size = SEQUENCE[k % len(SEQUENCE)], plane.fwhm[rows] / unit
+        colour = SEQUENCE[k % len(SEQUENCE)]
+        size = plane.fwhm[rows] / unit
         beams = EllipseCollection(
             size,
             size,
@@ -122,7 +124,8 @@ def _ticks(ax: Any, plane: Focalplane, rows: Any, unit: float, colour: str) -> N
     from matplotlib.collections import LineCollection
 
     rows = rows[plane.polarization_efficiency[rows] > 0]
-    angle, half = plane.polarization_angle[rows], 0.35 * plane.fwhm[rows] / unit
+    angle = plane.polarization_angle[rows]
+    half = 0.35 * plane.fwhm[rows] / unit
     axis = np.stack([np.sin(angle), np.cos(angle)], axis=1) * half[:, None]
     at = np.stack([plane.xi[rows], plane.eta[rows]], axis=1) / unit
     lines = list(np.stack([at - axis, at + axis], axis=1))
@@ -157,7 +160,9 @@ def draw_passband(ax: Any, band: Any) -> None:
     """Draw the relative transmission of a band over frequency, its centre, and its width about
     it.
     """
-    ghz, centre, half = band.frequency / 1e9, band.centre / 1e9, band.width / 2e9
+    ghz = band.frequency / 1e9
+    centre = band.centre / 1e9
+    half = band.width / 2e9
     spare = 0.15 * (ghz[-1] - ghz[0])
     x = np.concatenate([[ghz[0] - spare, ghz[0]], ghz, [ghz[-1], ghz[-1] + spare]])
     ax.plot(x, np.pad(band.transmission, 2), color=SEQUENCE[0], linewidth=1.4)
@@ -181,7 +186,8 @@ def draw_tracks(ax: Any, scans: Sequence[Any]) -> None:
 
     Earlier scans are drawn wider: a scan that repeats another's track does not hide it.
     """
-    tracks, axes = [], local_axes(*scans[0].centre)
+    tracks = []
+    axes = local_axes(*scans[0].centre)
     for o in scans:
         cosine, east, north = axes @ boresights(o.boresight_radec[_thin(o)])
         away = np.where(cosine > 0.1, cosine, np.nan)  # of the tangent plane

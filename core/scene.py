@@ -100,11 +100,9 @@ def site_at(location: Any) -> Site:
     if not getattr(location, "isscalar", True):
         raise mistake(f"expected one place, got {location.size}")
     place = location.to_geodetic("WGS84")
-    latitude, longitude, altitude = (
-        float(place.lat.rad),
-        float(place.lon.rad),
-        float(place.height.to_value("m")),
-    )
+    latitude = float(place.lat.rad)
+    longitude = float(place.lon.rad)
+    altitude = float(place.height.to_value("m"))
     name = str(
         getattr(getattr(location, "info", None), "name", None)
         or f"{place.lat.deg:.4f} deg {place.lon.deg:.4f} deg"
@@ -133,7 +131,8 @@ def distance(here: tuple[float, float], site: Site) -> float:
     """m along the ground between (latitude, longitude) [rad] and a site: Haversine formula on a
     sphere.
     """
-    a, b = np.array(here), np.array([site.latitude, site.longitude])
+    a = np.array(here)
+    b = np.array([site.latitude, site.longitude])
     half = np.sin((a - b) / 2) ** 2
     return (
         2

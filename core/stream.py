@@ -196,15 +196,14 @@ def columns(array: AnyFloats, samples: slice) -> AnyFloats:
     if not isinstance(array, np.memmap):
         return np.array(array[:, samples], order="C")
     found = np.empty((array.shape[0], samples.stop - samples.start), array.dtype)
-    whole, size = found.data.cast("B"), found.strides[0]
+    whole = found.data.cast("B")
+    size = found.strides[0]
     mapped: Any = array._mmap  # type: ignore[attr-defined]
     begin = array.ctypes.data - np.frombuffer(mapped, np.uint8).ctypes.data
     with open(str(array.filename), "rb", buffering=0) as file:
         for row in range(array.shape[0]):
-            place, left = (
-                begin + row * array.strides[0] + samples.start * array.itemsize,
-                whole[row * size : (row + 1) * size],
-            )
+            place = begin + row * array.strides[0] + samples.start * array.itemsize
+            left = whole[row * size : (row + 1) * size]
             while left:
                 read = _read_at(file, left, place)
                 if not read:
@@ -214,7 +213,8 @@ def columns(array: AnyFloats, samples: slice) -> AnyFloats:
                         place=str(array.filename),
                         cure=cure,
                     )
-                place, left = place + read, left[read:]
+                place = place + read
+                left = left[read:]
     return found
 
 
@@ -239,7 +239,8 @@ class Changed:
     def of(cls, values: Floats, stream: Stream, fixed: SmoothField | None = None) -> Changed:
         """Take the whole (n_det, n_samp), which is used up. The mean of ``stream`` stays beside it
         where it is nearer than zero; ``fixed``: one that others have, and that stays."""
-        mean, observation = stream.means.get(stream.name), stream.observation
+        mean = stream.means.get(stream.name)
+        observation = stream.observation
         if mean is not None and not _is_left(values, mean, observation):
             mean = None
         for field in (mean, fixed):
@@ -269,12 +270,12 @@ def whole(stream: Stream, fixed: SmoothField | None = None) -> Floats:
 
 def _is_left(values: AnyFloats, mean: SmoothField, observation: Observation) -> bool:
     """True if the mean is still in the signal: its samples are nearer to the mean than to zero."""
-    with_it, without, good = 0.0, 0.0, observation.good_samples
+    with_it = 0.0
+    without = 0.0
+    good = observation.good_samples
     for row in np.flatnonzero(observation.good_detectors):
         part = values[row, good]
         rest = part - mean.evaluate(slice(row, row + 1), slice(0, len(good)))[0, good]
-        with_it, without = (
-            with_it + float(np.nansum(rest * rest)),
-            without + float(np.nansum(part * part)),
-        )
+        with_it = with_it + float(np.nansum(rest * rest))
+        without = without + float(np.nansum(part * part))
     return with_it < without

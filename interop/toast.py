@@ -155,7 +155,9 @@ class Simulate(toast.ops.Operator):  # type: ignore[misc, name-defined]
         scene: dict[str, Any] | None = None,
         **traits: Any,
     ) -> None:
-        self._operators, self._seed, self._scene = list(operators), seed, dict(scene or {})
+        self._operators = list(operators)
+        self._seed = seed
+        self._scene = dict(scene or {})
         super().__init__(**traits)
         if any("boresight" in operator.provides for operator in self._operators):
             cure = "leave it out: the observations are pointed already"

@@ -77,7 +77,8 @@ def hexagons(number: int, size: float) -> Rotation:
     """
     x, y = hexagon(number)
     distance = np.hypot(x, y) * size / max(float(np.abs(x).max()), 1.0)
-    sine, angle = np.sin(distance), np.arctan2(y, x)
+    sine = np.sin(distance)
+    angle = np.arctan2(y, x)
     row = np.rint(y / (math.sqrt(3) / 2)).astype(int)
     return turned(sine * np.cos(angle), sine * np.sin(angle), np.pi / 4 * (row % 2))
 
@@ -126,7 +127,8 @@ class Wafers:
         """
         one = self.pixels(number // self.wafers, self.size)
         frames = np.concatenate([(place * one).as_matrix() for place in self.places])
-        x, y = -frames[:, 1, 2] / frames[:, 2, 2], -frames[:, 0, 2] / frames[:, 2, 2]
+        x = -frames[:, 1, 2] / frames[:, 2, 2]
+        y = -frames[:, 0, 2] / frames[:, 2, 2]
         angle = np.arctan2(frames[:, 1, 0] - frames[:, 0, 1], frames[:, 0, 0] + frames[:, 1, 1])
         wafer = np.repeat(np.arange(self.wafers), number // self.wafers)
         return Layout(x, y, wafer, angle, radius=float(np.hypot(x, y).max()) * self.margin)

@@ -29,8 +29,12 @@ class Progress:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._lock, self._clock = threading.Lock(), clock
-        self._what, self._began, self._shown, self._visible = "", 0.0, 0.0, False
+        self._lock = threading.Lock()
+        self._clock = clock
+        self._what = ""
+        self._began = 0.0
+        self._shown = 0.0
+        self._visible = False
         self._logged: float | None = None
 
     @hookimpl
@@ -48,7 +52,9 @@ class Progress:
         now = self._clock()
         with self._lock:
             if what != self._what:
-                self._what, self._began, self._shown = what, now, 0.0
+                self._what = what
+                self._began = now
+                self._shown = 0.0
             self._show(now, done == total, line(done, total, what, now - self._began))
 
     @hookimpl
@@ -81,7 +87,8 @@ class Progress:
                 sys.stderr.write(text + "\n")
                 sys.stderr.flush()
         elif last or now - self._shown >= INTERVAL:
-            self._shown, self._visible = now, True
+            self._shown = now
+            self._visible = True
             sys.stderr.write("\r\033[K" + text)
             sys.stderr.flush()
 
@@ -100,7 +107,8 @@ class Progress:
             if self._visible:
                 sys.stderr.write("\r\033[K")
                 sys.stderr.flush()
-            self._what, self._visible = "", False
+            self._what = ""
+            self._visible = False
 
 
 def line(done: int, total: int, what: str, seconds: float, width: int = 20) -> str:

@@ -129,7 +129,8 @@ def timed_run(
             if not (alone and compiled.buffer):
                 break
             del data
-        memory, own = peak_memory(), variant.variant.steps([measures])
+        memory = peak_memory()
+        own = variant.variant.steps([measures])
         adds = measures.signals(variant.file.runs) or len(measures.steps(own)) > len(own)
         found = None if alone and adds else measures.measure(data)
         return TimedRun(found, by_step(data, seconds), memory, first)
@@ -280,8 +281,14 @@ class Bench:
         setup: Setup,
         say: Callable[[str], None] = lambda what: None,
     ) -> None:
-        self.run, self.metric, self.yardstick, self.setup = run, metric, yardstick, setup
-        self.say, self.runs, self.cpu, self._dearest = say, 0, 0.0, 0.0
+        self.run = run
+        self.metric = metric
+        self.yardstick = yardstick
+        self.setup = setup
+        self.say = say
+        self.runs = 0
+        self.cpu = 0.0
+        self._dearest = 0.0
         self.names = {_key(yardstick): "reference"}
         self._references: list[TimedRun] = []
         self._since = 0
@@ -292,7 +299,8 @@ class Bench:
         """The measurement of a setting; made where it is not there yet. Raises `ZondaError` where
         the run refuses the setting.
         """
-        key, seeds = _key(setting), self.setup.seeds
+        key = _key(setting)
+        seeds = self.setup.seeds
         if key in self._refused:
             raise self._refused[key]
         done = self._done.get(key, Measured())

@@ -164,7 +164,9 @@ def settings_for(file: PipelineFile, target: float, metric: str = "map_rms") -> 
     known = {k.key for k in knobs}
     given = [k.key for k in knobs if k.given]
     path = path_for(file, metric)
-    why, point, front = f"no stored Pareto front of {metric} for this pipeline ({path})", None, None
+    why = f"no stored Pareto front of {metric} for this pipeline ({path})"
+    point = None
+    front = None
     if path.is_file():
         front = read(path)
         changed = [

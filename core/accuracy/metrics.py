@@ -81,7 +81,8 @@ class Metric:
         """Relative error of one run against another with the same random numbers; 0 only where they
         are alike.
         """
-        a, b = self.summary(found), self.summary(reference)
+        a = self.summary(found)
+        b = self.summary(reference)
         size = float(np.linalg.norm(b))
         return float(np.linalg.norm(a - b)) / size if size > 0 else float(np.any(a != b))
 
@@ -104,7 +105,8 @@ class Metric:
         What the same seed leaves in common in both cancels in d.
         """
         a, b = (np.array([self.summary(f) for f in runs]) for runs in (found, reference))
-        size, count = np.mean(b.mean(0) ** 2), len(a)
+        size = np.mean(b.mean(0) ** 2)
+        count = len(a)
         d = a - b
         error = np.mean(d.mean(0) ** 2) / size
         resolution = np.mean(d.var(0, ddof=1) / count) / size if count > 1 else np.inf

@@ -254,9 +254,11 @@ def _exchange(turning: Sequence[Alone], here: Point, allowed: float) -> Setting 
     """The setting that saves most, as predicted: one knob relaxed, and others tightened until the
     error is allowed again.
     """
-    best, most = None, here.spread
+    best = None
+    most = here.spread
     for step in _steps(turning, here.setting):
-        setting, taken = here.setting | {step.key: step.value}, [step]
+        setting = here.setting | {step.key: step.value}
+        taken = [step]
         while here.error + sum(t.error for t in taken) > allowed:
             ways = [t for a in turning if a.knob.key != step.key for t in _tighter(a, setting)]
             if not ways:
@@ -267,7 +269,8 @@ def _exchange(turning: Sequence[Alone], here: Point, allowed: float) -> Setting 
         else:
             saving = sum(t.saving for t in taken)
             if saving > most:
-                best, most = setting, saving
+                best = setting
+                most = saving
     return best
 
 

@@ -78,7 +78,9 @@ def arguments(setting: Mapping[str, str]) -> str:
 
 
 def _heading(study: Study) -> Iterator[str]:
-    setup, reference, found = study.setup, study.points[0], study.sweep
+    setup = study.setup
+    reference = study.points[0]
+    found = study.sweep
     yield f"error of {setup.metric}: {study.says}"
     if setup.shorter:
         shorter = ", ".join(f"{k} = {v}" for k, v in setup.shorter.items())
@@ -113,7 +115,9 @@ def _heading(study: Study) -> Iterator[str]:
 
 
 def _alone(alone: Alone) -> Iterator[str]:
-    knob, last, rows = alone.knob, alone.rungs[-1], []
+    knob = alone.knob
+    last = alone.rungs[-1]
+    rows = []
     yield f"{knob.key}: {knob.approximates}"
     if alone.inert:
         yield "  changes nothing here: the coarsest value gives the same bits as the tightest"
@@ -161,11 +165,14 @@ def _front(study: Study) -> Iterator[str]:
 
 
 def _recommended(study: Study) -> Iterator[str]:
-    target, left, chosen = study.setup.target, study.sweep.left, study.chosen
+    target = study.setup.target
+    left = study.sweep.left
+    chosen = study.chosen
     if chosen is None:
         yield from not_met(study)
         return
-    reference, best = study.points[0], least(study.points, target, left)
+    reference = study.points[0]
+    best = least(study.points, target, left)
     error = f"{percent(chosen.error)} (+ {percent(left)} of the reference), {_cost(chosen)} CPU s"
     if best is None or chosen.seconds <= best.seconds:
         ratio = reference.seconds / chosen.seconds if chosen.seconds else math.nan
@@ -188,13 +195,16 @@ def not_met(study: Study) -> Iterator[str]:
     """Why no setting is shown to meet the target, what the reference's own error comes from most,
     and what to do about it.
     """
-    setup, left = study.setup, study.sweep.left
+    setup = study.setup
+    left = study.sweep.left
     yield (
         f"no setting is shown to meet {percent(setup.target)}: the reference is not known to better"
         f" than {percent(left)}"
     )
     worst = max(study.sweep.alone, key=lambda a: a.stays if a.knob.redraws else a.left)
-    key, seeds, cures = worst.knob.key, len(setup.seeds), []
+    key = worst.knob.key
+    seeds = len(setup.seeds)
+    cures = []
     unmeasured = [a.knob.key for a in study.sweep.alone if a.unmeasured]
     cause = f"{key}, {percent(worst.stays)}"
     if unmeasured:
@@ -232,7 +242,9 @@ def draw(study: Study) -> Any:
     from matplotlib.ticker import LogLocator
 
     ax = new_axes((7.6, 5.4))
-    setup, chosen, front = study.setup, study.chosen, study.front
+    setup = study.setup
+    chosen = study.chosen
+    front = study.front
     alone = [a for a in study.sweep.alone if not a.knob.redraws]
     errors = [p.error for p in study.points] + [r.error or 0.0 for a in alone for r in a.rungs]
     bottom = min([e for e in errors if e > 0] + [setup.target]) / 4
@@ -243,7 +255,8 @@ def draw(study: Study) -> Any:
         ax.errorbar(x, y, xerr=bars, color=color, label=label, elinewidth=0.7, **style)
 
     for number, knob in enumerate(a for a in alone if not a.inert):
-        rungs, colour = [r for r in knob.rungs if r.error is not None], SEQUENCE[number % 7]
+        rungs = [r for r in knob.rungs if r.error is not None]
+        colour = SEQUENCE[number % 7]
         marker = "osD^vPX"[number % 7]
         line(rungs, f"{knob.knob.key} alone", colour, marker=marker, ms=5, lw=0.9)
         same = [r.seconds for r in rungs if not r.error]

@@ -16,7 +16,8 @@ from ..plan.planning import PRECISION, Knob, planning_of
 Setting = dict[str, str]
 """Values by key, both as ``--set`` takes them: {"PinkNoise.poles": "8"}."""
 
-QUICK_SECONDS, QUICK_SCANS = 30.0, 2
+QUICK_SECONDS = 30.0
+QUICK_SCANS = 2
 QUICK_SAMPLES, QUICK_SHORTEST = 6e6, 5.0
 """Samples of all detectors in all scans above which ``--quick`` makes scans shorter still, down to
 so many seconds.

@@ -163,7 +163,8 @@ def sweep(bench: Bench, knobs: Sequence[PipelineKnob]) -> Sweep:
     every = bench.may(bench.missing(found.reference, all_seeds=True))
     bench.measure(found.reference, all_seeds=every)
     for knob, value, spare in _in_order(knobs, bench):
-        setting, reference = found.turned(knob, value), found.turned(knob, knob.tightest)
+        setting = found.turned(knob, value)
+        reference = found.turned(knob, knob.tightest)
         first = found.turned(knob, knob.ladder[0])
         known = value != knob.ladder[0] and not knob.redraws and bench.has(first)
         if known and bench.error(first, reference) == 0:
@@ -248,7 +249,8 @@ def convergence(steps: Sequence[float], resolutions: Sequence[float] = ()) -> tu
     changing = [step for step in steps if step > 0]
     if not changing:
         return 0.0, "no rung changes anything"
-    last, earlier = changing[-1], changing[:-1]
+    last = changing[-1]
+    earlier = changing[:-1]
     if not earlier:
         return last, f"one step changes anything, by {100 * last:.2g} %: that step, not a bound"
     larger = [step for step in earlier if step > last]

@@ -28,7 +28,9 @@ def steps(operators: Any, name: str) -> list[Operator]:
             place=name,
             cure=cure,
         )
-    made, wrong, cures = [], [], []
+    made = []
+    wrong = []
+    cures = []
     for k, operator in enumerate(operators, 1):
         if isinstance(operator, Operator):
             made.append(operator.model_copy())

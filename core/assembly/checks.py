@@ -53,7 +53,8 @@ def looks(
     None stands for a step that could not be made. ``say`` is told each step before it is looked at.
     """
     made = frozenset().union(*(made_by(operator) for operator in operators if operator is not None))
-    data, found = Data(scene=scene, made=made), list[list[str]]()
+    data = Data(scene=scene, made=made)
+    found = list[list[str]]()
     refused: list[tuple[int, ZondaError]] = []
     for text in doubts(scene.instrument):
         warnings.warn(text, stacklevel=3)

@@ -51,7 +51,8 @@ def check_order(operators: Sequence[Operator]) -> list[OrderProblem]:
                     )
                 )
             else:
-                found, above = makers(what), {type(o).__name__ for o in operators[:index]}
+                found = makers(what)
+                above = {type(o).__name__ for o in operators[:index]}
                 cure = nearest(what, sorted(have)) or ""
                 if found:
                     cure = f"{' or '.join(found)} provides it"

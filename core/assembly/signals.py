@@ -152,7 +152,9 @@ class Signals:
         only: Sequence[str],
         place: str,
     ) -> None:
-        self.operators, self.runs, self._place = list(operators), dict(runs), place
+        self.operators = list(operators)
+        self.runs = dict(runs)
+        self._place = place
         self._generators = _generators(operators)
         former = next((o for o in operators if forms(o)), None)
         self._inputs = (
@@ -221,10 +223,8 @@ class Signals:
                     cure=cure,
                 )
             parts = self.remainders.get(stream.partition("/")[2], ())
-            what, cure = (
-                "there is no such signal",
-                nearest(stream, made) or f"choose from: {', '.join(made)}",
-            )
+            what = "there is no such signal"
+            cure = nearest(stream, made) or f"choose from: {', '.join(made)}"
             if parts:
                 what = f"it is {remainder(parts)}, in the maps alone"
                 cure = (
@@ -352,7 +352,8 @@ class Signals:
 
     def _fits(self, name: str) -> bool:
         """Tell whether a signal is a term of equation (1)."""
-        signal, kept = self.runs[name], self.makers(name)
+        signal = self.runs[name]
+        kept = self.makers(name)
         names_it = TRANSMISSION in [*(signal.only or ()), *(signal.without or ())]
         narrowed = self._only is not None
         whole = kept == self.makers("")
@@ -385,7 +386,8 @@ def note_signals(
 ) -> None:
     """Note in observations which components there are and which signals are formed."""
     formed = list(formed)
-    names, streams = frozenset(components), tuple(sorted(signal.stream for signal in formed))
+    names = frozenset(components)
+    streams = tuple(sorted(signal.stream for signal in formed))
     unfiltered = frozenset(signal.stream for signal in formed if not signal.filtered)
     for observation in observations:
         observation.components, observation.signals, observation.unfiltered = (

@@ -81,7 +81,8 @@ def resume(folder: Path, anyway: bool, same_machine: bool | None, **how: Any) ->
     from . import run as campaign
     from .campaign_file import Job
 
-    given, job = SimpleNamespace(**how), Job.read(folder)
+    given = SimpleNamespace(**how)
+    job = Job.read(folder)
     with (
         _working(_campaign_of(job), folder, given) as pool,
         lock(folder),

@@ -188,7 +188,8 @@ class Record:
     """
 
     def __init__(self, job: Job, folder: Path, share: str = "") -> None:
-        self.job, self.folder = job, folder
+        self.job = job
+        self.folder = folder
         self.done: dict[int, TaskRow] = {}
         self.combined: dict[int, Any] = {}
         self._path = folder / TASKS / AT_WORK.format(share=share)
@@ -223,7 +224,8 @@ class Record:
     def succeeded(self, task: Task, host: str, seconds: float, machine: str) -> None:
         """Record that a task's product is complete."""
         self._at_work.discard(task.number)
-        attempts, error = self._attempts[task.number], _failure(task, self.folder).error
+        attempts = self._attempts[task.number]
+        error = _failure(task, self.folder).error
         self.done[task.number] = TaskRow(
             task.number,
             "done",
@@ -275,7 +277,9 @@ class Record:
         ``same_machine``: products of another kind of machine than the first task's are removed.
         """
         found: list[tuple[Task, TaskRow]] = []
-        missing, damaged, strange = [], 0, 0
+        missing = []
+        damaged = 0
+        strange = 0
         for task in tasks:
             path = task.path(self.folder)
             try:
@@ -312,9 +316,12 @@ def done_row(task: Task, folder: Path) -> TaskRow:
     """The row of a task whose partial product is there. Raises `InputError` where it is not, or its
     head is damaged.
     """
-    made, failure = trees.head(task.path(folder), task.key), _failure(task, folder)
+    made = trees.head(task.path(folder), task.key)
+    failure = _failure(task, folder)
     try:
-        host, seconds, machine = str(made["host"]), float(made["seconds"]), str(made["machine"])
+        host = str(made["host"])
+        seconds = float(made["seconds"])
+        machine = str(made["machine"])
     except (KeyError, TypeError, ValueError) as err:
         raise InputError(f"cannot be used: {err}", place=str(task.path(folder))) from None
     attempts = failure.attempts + 1
@@ -339,8 +346,10 @@ def _failure(task: Task, folder: Path) -> TaskRow:
             _failed_path(task, folder).read_text(encoding="utf-8")
         )
         state = "failed" if found["state"] == "failed" else "waiting"
-        error, host = str(found["error"]), str(found["host"])
-        attempts, seconds = int(found["attempts"]), float(found["seconds"])
+        error = str(found["error"])
+        host = str(found["host"])
+        attempts = int(found["attempts"])
+        seconds = float(found["seconds"])
         return TaskRow(task.number, state, attempts, error, host, seconds)
     except (OSError, ValueError, TypeError, KeyError):
         return TaskRow(task.number)

@@ -117,10 +117,8 @@ def campaign(
         PLACE,
     )
     keys = _keys(pipeline)
-    settings, folder = (
-        Campaign(**{key: _plain(value, key) for key, value in axes.items()}),
-        Path(output),
-    )
+    settings = Campaign(**{key: _plain(value, key) for key, value in axes.items()})
+    folder = Path(output)
     options = {"workers": settings.workers, "scheduler": settings.scheduler, "tls": settings.tls}
     with engine(
         settings.engine,

@@ -45,12 +45,15 @@ def differences(one: str, other: str) -> str:
     """Differences of two machines in words: ``numpy 2.3.1 (2.4.6 there), ...``; of instructions,
     those that one of the two lacks.
     """
-    a, b = read(one), read(other)
+    a = read(one)
+    b = read(other)
     found = []
     for key in sorted((a.keys() | b.keys()) - WITHOUT_INFLUENCE):
-        mine, theirs = a.get(key, "none"), b.get(key, "none")
+        mine = a.get(key, "none")
+        theirs = b.get(key, "none")
         if mine != theirs and key.endswith("instructions"):
-            own, others = set(mine.split()), set(theirs.split())
+            own = set(mine.split())
+            others = set(theirs.split())
             words = [
                 f"{sign} {' '.join(names[:3])}{' ...' * (len(names) > 3)}"
                 for sign, names in (
@@ -86,7 +89,9 @@ class Watch:
     """
 
     def __init__(self, known: Mapping[int, str], strict: bool, folder: Path, say: Say) -> None:
-        self._strict, self._folder, self.say = False, folder, say
+        self._strict = False
+        self._folder = folder
+        self.say = say
         self._first = ""
         self._told: set[frozenset[tuple[str, str]]] = set()
         for number in sorted(known):

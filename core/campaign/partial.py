@@ -135,7 +135,8 @@ class Partial:
         """Thinned scans, each of its bands in turn; the focal plane is as the steps left it in the
         very first one.
         """
-        whole, cameras = scene.instrument.focalplane(), list(scene.instrument.cameras.values())
+        whole = scene.instrument.focalplane()
+        cameras = list(scene.instrument.cameras.values())
         planes = [whole.of_band(k) if len(cameras) > 1 else whole for k in range(len(cameras))]
         for plane, first in zip(planes, self.scans, strict=False):
             for name, values in first["focal_plane"].items():
@@ -224,7 +225,8 @@ def _thinned(observation: Observation, number: int) -> dict[str, Any]:
     """A scan as a report shows it, with a subset of its boresight directions. ``number``: its place
     in the campaign.
     """
-    n, elevation = observation.n_samples, observation.elevation
+    n = observation.n_samples
+    elevation = observation.elevation
     kept = np.linspace(0, n - 1, min(n, POINTS if number < SCANS else 16)).round().astype(int)
     kept = np.unique([*kept, elevation.argmin(), elevation.argmax()])
     return {

@@ -86,7 +86,8 @@ def job(
     """
     from zonda import __version__
 
-    draft, first = _Draft(folder, pruning, say), sources[0].campaign
+    draft = _Draft(folder, pruning, say)
+    first = sources[0].campaign
     for source in sources:
         draft.add(source)
     return Job(
@@ -117,7 +118,9 @@ class _Draft:
         pruning: Pruning,
         say: Callable[[int, int, str], None],
     ) -> None:
-        self._folder, self._pruning, self._say = folder, pruning, say
+        self._folder = folder
+        self._pruning = pruning
+        self._say = say
         self.pipelines: list[str] = []
         self.plans: list[tuple[tuple[str, ...], ...]] = []
         self.combinations: list[Combination] = []
@@ -140,7 +143,8 @@ class _Draft:
             share = 1 / math.sqrt(len(members))
             for number in members:
                 self._say(len(entries), len(found), "campaign: plans and grids")
-                entry, plan = found[number], (found[number].settings, share)
+                entry = found[number]
+                plan = (found[number].settings, share)
                 if plan not in planned:  # those that differ in seed and night alone share a plan
                     planned[plan] = self._plan(source, entry, share)
                 entries[number] = PlannedEntry(
@@ -197,7 +201,8 @@ class _Draft:
         name, subfolder = _names(source, first, self.combinations)
         path = layout_path(self._folder, len(self.combinations))
         trees.write(path, "layout", {"layouts": layouts})
-        layout, before = trees.digest_of(path), 0
+        layout = trees.digest_of(path)
+        before = 0
         self.combinations.append(Combination(name, subfolder, layout, first.combination))
         for (number, entry), samples in zip(entries.items(), scans, strict=True):
             every = tuple(range(len(samples)))
@@ -327,7 +332,8 @@ def restore_layout(job: Job, folder: Path, number: int) -> None:
 
     numbers = dict.fromkeys(task.entry for task in job.tasks_of[number])
     files = [parse(text, name="campaign", folder=folder) for text in job.pipelines]
-    path, entries = layout_path(folder, number), [job.entries[entry] for entry in numbers]
+    path = layout_path(folder, number)
+    entries = [job.entries[entry] for entry in numbers]
     trees.write(path, "layout", {"layouts": common_layouts(entries, files, folder)[0]})
     if trees.digest_of(path) != job.combinations[number].layout:
         raise InputError(
@@ -348,9 +354,11 @@ def _names(source: CampaignFile, entry: Entry, others: Sequence[Combination]) ->
     folder = product_path("", "_".join(texts)).name if texts else ""
     folder = "/".join(filter(None, (source.name, folder)))
     taken = {c.folder for c in others}
-    plain, k = folder, 2
+    plain = folder
+    k = 2
     while folder in taken:
-        folder, k = f"{plain}.{k}", k + 1
+        folder = f"{plain}.{k}"
+        k = k + 1
     return ", ".join(filter(None, (source.name, name))), folder
 
 
@@ -375,7 +383,8 @@ def _inputs(file: PipelineFile, folder: Path) -> dict[str, str]:
     """The file and the inputs that it names, each with its stamp; of those in the campaign's own
     ``folder`` a hash.
     """
-    own, root = [Path(file.place).resolve()] if Path(file.place).is_file() else [], folder.resolve()
+    own = [Path(file.place).resolve()] if Path(file.place).is_file() else []
+    root = folder.resolve()
     arrays = root / INPUTS
     inputs = file.inputs
     stamps = {str(p): _stamp(p, "file") for p in inputs if not p.is_relative_to(arrays)}

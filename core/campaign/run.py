@@ -65,7 +65,9 @@ class Point:
 
 def write_table(record: Record) -> None:
     """Write the table of a campaign whose combinations are all finished."""
-    job, folder, points = record.job, record.folder, collected(record)
+    job = record.job
+    folder = record.folder
+    points = collected(record)
     axes = list(dict.fromkeys(key for point in points for key in point.axes))
     rows = [
         {key: point.axes.get(key, "") for key in axes}
@@ -132,7 +134,8 @@ def _panel(ax: Any, points: Sequence[Point]) -> None:
         lines.setdefault(name, []).append((place, point.values))
     for number, (name, line) in enumerate(lines.items()):
         line.sort(key=lambda item: item[0])
-        colour, x = SEQUENCE[number % len(SEQUENCE)], [place for place, _ in line]
+        colour = SEQUENCE[number % len(SEQUENCE)]
+        x = [place for place, _ in line]
         mean, scatter, error = np.array([(v.mean, v.scatter, v.standard_error) for _, v in line]).T
         for size, style in ((scatter, {"lw": 0.7, "alpha": 0.6}), (error, {"lw": 2.2})):
             ax.vlines(x, mean - size, mean + size, colour, **style)
@@ -333,7 +336,8 @@ def _watch(record: Record, strict: bool, say: Say) -> Watch:
 
 def _work(record: Record, pool: Pool, watch: Watch, tasks: Sequence[Task]) -> CampaignResult:
     """Run tasks, combine what is complete, remove partial products."""
-    job, folder = record.job, record.folder
+    job = record.job
+    folder = record.folder
     result = Tasks(record, pool, watch).run(tasks)
     if result.tasks:
         _tell(result, watch.say)

@@ -34,10 +34,12 @@ class CampaignHeader(Header):
 
 def rewrite_campaign(document: Document) -> list[Diagnostic]:
     """Move ``campaign.schedule`` to the pointing step that takes one; return the mistakes."""
-    value, path = document.value["campaign"], ("campaign", "schedule")
+    value = document.value["campaign"]
+    path = ("campaign", "schedule")
     if not isinstance(value, dict) or value.get("schedule") is None:
         return []
-    given, at = document.sub(path), document.mark(path).start
+    given = document.sub(path)
+    at = document.mark(path).start
     del value["schedule"]
     step = next(
         (
@@ -194,7 +196,8 @@ def _mistakes(
         for k, entry in enumerate(campaign.observations)
     ]
     for together in [*grid, *listed]:
-        changed, wrong = document.copy(), False
+        changed = document.copy()
+        wrong = False
         for key, path in together:
             span = document.mark(path[:3] if path[1] == "grid" else path).start
             if key in refused:

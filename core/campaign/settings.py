@@ -71,7 +71,8 @@ def entries(
         own = {k: v for k, v in values.items() if k not in ("observation", "seed")}
         settings = tuple(setting(k, v) for k, v in own.items())
         first = time_of(settings)
-        base, anew = int(values.get("seed", seed)), _drawn_anew(campaign, values)
+        base = int(values.get("seed", seed))
+        anew = _drawn_anew(campaign, values)
         for night, moment in _nights(campaign.nights, first):
             for realization in range(campaign.realizations):
                 place = dict(values)
@@ -128,7 +129,8 @@ def _nights(nights: Nights | None, first: Instant) -> Iterator[tuple[int, Instan
         yield 0, first
         return
     if nights.start is None or nights.stop is None:
-        low, high = 0, (nights.count or 1) * nights.every
+        low = 0
+        high = (nights.count or 1) * nights.every
     else:
         low = math.ceil(nights.start.seconds_since(first) / TURN)
         high = math.ceil(nights.stop.seconds_since(first) / TURN)

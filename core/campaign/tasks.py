@@ -102,7 +102,8 @@ class Outcome:
 
 def perform(order: Order) -> Outcome:
     """Run a task. Never raises an `Exception`: the outcome states what failed."""
-    begin, host = time.monotonic(), f"{socket.gethostname()}:{os.getpid()}"
+    begin = time.monotonic()
+    host = f"{socket.gethostname()}:{os.getpid()}"
     try:
         if __version__ != order.version:
             raise PipelineError(
@@ -124,7 +125,9 @@ def perform(order: Order) -> Outcome:
 @faults_named()
 def _run(order: Order, host: str, begin: float) -> tuple[float, str]:
     """Write the product of a task; wall time since ``begin``, and the machine."""
-    task, folder, file = order.task, order.folder, pipeline_of(order.pipeline, order.folder)
+    task = order.task
+    folder = order.folder
+    file = pipeline_of(order.pipeline, order.folder)
     variant = Variant(file.pipeline(), order.entry.scene(file))
     layouts = layouts_in(layout_path(folder, task.combination), order.layout)
     part = Part(task.scans, layouts, f"{task.entry:06d}-")
@@ -138,7 +141,8 @@ def _run(order: Order, host: str, begin: float) -> tuple[float, str]:
             provenance={"resolved_yaml": order.pipeline},
         )
     partial = Partial.of(data, task.before, part.prefix)
-    seconds, machine = time.monotonic() - begin, machines.here()
+    seconds = time.monotonic() - begin
+    machine = machines.here()
     made = {"host": host, "seconds": seconds, "machine": machine}
     partial.write(task.path(folder), task.key, made)
     return seconds, machine
@@ -197,10 +201,12 @@ def combined(job: Job, folder: Path, number: int, threads: int | None = None) ->
     """Finished data of `combine`. Raises `InputError` if a partial product is missing or
     damaged.
     """
-    combination, tasks = job.combinations[number], job.tasks_of[number]
+    combination = job.combinations[number]
+    tasks = job.tasks_of[number]
     first = job.entry_of(tasks[0])
     file = pipeline_of(job.pipelines[first.pipeline], folder)
-    pipeline, scene = file.pipeline(), first.scene(file)
+    pipeline = file.pipeline()
+    scene = first.scene(file)
     data = Data(scene, output=check_output_folder(folder / combination.folder))
     data.threads = threads or available_threads()
     data.provenance = {
@@ -276,7 +282,10 @@ class Tasks(Work[Task, Outcome]):
 
     def __init__(self, record: Record, pool: Pool, watch: Watch) -> None:
         super().__init__(pool, str(record.folder), f"zonda resume {record.folder}")
-        self.folder, self.job, self.record, self.watch = record.folder, record.job, record, watch
+        self.folder = record.folder
+        self.job = record.job
+        self.record = record
+        self.watch = watch
         self.result = CampaignResult(record.folder)
         self._failures = 0
 
@@ -299,7 +308,8 @@ class Tasks(Work[Task, Outcome]):
 
     def call(self, item: Task) -> tuple[Callable[[Order], Outcome], Order]:
         """See `Work.call`."""
-        job, entry = self.job, self.job.entry_of(item)
+        job = self.job
+        entry = self.job.entry_of(item)
         return perform, Order(
             item,
             entry,
@@ -323,7 +333,9 @@ class Tasks(Work[Task, Outcome]):
         ):
             discard(item.path(self.folder))
             outcome = replace(outcome, error=error, final=True, stop=True)
-        host, seconds, error = outcome.host, outcome.seconds, outcome.error
+        host = outcome.host
+        seconds = outcome.seconds
+        error = outcome.error
         again = bool(error) and not outcome.final and self.attempts[item] <= self.job.retries
         if not error:
             self.record.succeeded(item, host, seconds, outcome.machine)
@@ -348,9 +360,13 @@ class Combinations(Work[int, Combined]):
     """
 
     def __init__(self, record: Record, result: CampaignResult, pool: Pool) -> None:
-        cure, retries = f"zonda resume {record.folder}", record.job.retries
+        cure = f"zonda resume {record.folder}"
+        retries = record.job.retries
         super().__init__(pool, str(record.folder), cure, retries)
-        self.folder, self.job, self.record, self.result = record.folder, record.job, record, result
+        self.folder = record.folder
+        self.job = record.job
+        self.record = record
+        self.result = result
 
     def call(self, item: int) -> tuple[Callable[..., Combined], Path, int, int | None]:
         """See `Work.call`."""

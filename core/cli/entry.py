@@ -178,7 +178,8 @@ class _Unbroken:
     """
 
     def __init__(self, stream: Any, lossy: bool) -> None:
-        self._stream, self.lossy = stream, lossy
+        self._stream = stream
+        self.lossy = lossy
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -256,7 +257,8 @@ def _plain_warnings() -> Iterator[None]:
 
     A warning that differs from an earlier one in its figures alone is not shown again.
     """
-    usual, usual_show = warnings.formatwarning, warnings.showwarning
+    usual = warnings.formatwarning
+    usual_show = warnings.showwarning
     shown: set[str] = set()
 
     def one_line(

@@ -116,7 +116,8 @@ def _run_one(request: RunRequest, file: PipelineFile) -> None:
     from ..storage.files import check_output_folder, write_text
     from ..storage.output_folder import lock, recording
 
-    pipeline, settings = request.pipelines[0], request.settings
+    pipeline = request.pipelines[0]
+    settings = request.settings
     if request.only and request.verify:
         raise click.UsageError("--verify measures the whole pipeline: leave --only out")
     if request.only:
@@ -146,7 +147,8 @@ def _run_one(request: RunRequest, file: PipelineFile) -> None:
     click.echo(str(made), err=True)
     if omitted := made.omitted(file):
         click.echo(f"omitted: {', '.join(omitted)} (zonda plan says why)", err=True)
-    whole, file = len(file.steps), made.apply(file)
+    whole = len(file.steps)
+    file = made.apply(file)
     resolved = file.resolved_yaml()
     provenance = {"resolved_yaml": resolved, "command": request.command, "plan": made.short}
     if campaign_there:

@@ -204,7 +204,8 @@ def members(field: FieldInfo) -> tuple[Any, ...]:
 
 
 def _alternatives(annotation: Any) -> Iterator[Any]:
-    origin, arguments = get_origin(annotation), get_args(annotation)
+    origin = get_origin(annotation)
+    arguments = get_args(annotation)
     if origin is Annotated:
         yield from _alternatives(arguments[0])
     elif origin in (Union, UnionType):

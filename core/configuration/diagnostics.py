@@ -132,7 +132,8 @@ class Diagnostic:
         end = self.span.end_column if self.span.end_line == row else len(line.rstrip())
         cut = max(0, start - WIDTH // 2) if len(line) > WIDTH else 0
         shown = line[cut : cut + WIDTH]
-        before, under = line[cut:start], line[start : min(end, cut + WIDTH)]
+        before = line[cut:start]
+        under = line[start : min(end, cut + WIDTH)]
         indent = "".join(c if c == "\t" else " " * _columns(c) for c in before)
         caret = "^" * max(1, _columns(under))
         gutter = " " * len(str(row + 1))
@@ -174,7 +175,8 @@ class ConfigurationError(ZondaError):
         count = f"{len(found)} mistake{'s' if len(found) != 1 else ''}"
         where = dict.fromkeys(d.span.source.name for d in found)
         super().__init__(f"{count} in {' and '.join(filter(None, where)) or place}", place="")
-        self.diagnostics, self.place = found, place
+        self.diagnostics = found
+        self.place = place
 
     def __reduce__(self) -> tuple[type[ConfigurationError], tuple[list[Diagnostic], str]]:
         return type(self), (self.diagnostics, self.place)

@@ -127,7 +127,8 @@ class _Validated:
 
     def diagnostic(self, e: Any) -> Diagnostic:
         """One of pydantic's errors."""
-        path, loc = self.at, []
+        path = self.at
+        loc = []
         place = (
             e["loc"][:-1]
             if e["type"] == "missing"
@@ -182,7 +183,8 @@ class _Validated:
 
     def value(self, e: Any, path: Path, loc: list[Any]) -> Diagnostic:
         _, field = _field(self.model, loc)
-        context, span = e.get("ctx", {}), self.document.marks[path].value
+        context = e.get("ctx", {})
+        span = self.document.marks[path].value
         if (
             isinstance(inner := context.get("error"), ConfigurationError) and inner.diagnostics
         ):  # a call within
@@ -206,7 +208,9 @@ class _Validated:
 
     def message(self, e: Any, unit: Unit | None, path: Path) -> tuple[str, str]:
         """(message, label) for a mistaken value."""
-        kind, context, given = e["type"], e.get("ctx", {}), f"{e['input']!r:.60}"
+        kind = e["type"]
+        context = e.get("ctx", {})
+        given = f"{e['input']!r:.60}"
         if kind in _LIMITS:
             return _limit(e, unit, self.document, path), ""
         if kind == "literal_error":

@@ -212,7 +212,8 @@ class PipelineFile:
 
         ``say`` is told each step before it is looked at.
         """
-        pipeline, scene = self.pipeline(), scene or self.scene()
+        pipeline = self.pipeline()
+        scene = scene or self.scene()
         if self.document is None:
             return run_checks(pipeline, scene, saved=saved)
         found, refused = looks(pipeline.operators, scene, say)
@@ -300,7 +301,8 @@ def _filled(operator: Operator) -> dict[str, Any]:
     operator refuses when they are written down (e.g. the ordering of HEALPix pixels for a map that
     is not HEALPix).
     """
-    model, fields = type(operator), type(operator).model_fields
+    model = type(operator)
+    fields = type(operator).model_fields
     values = operator.model_dump(mode="json")
     values = {
         k: v

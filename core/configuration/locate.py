@@ -39,7 +39,8 @@ def locate(path_or_name: str | Path) -> Path:
             place=f"{path_or_name!r:.60}",
             cure=f"give the path of a YAML file; {SHIPPED}",
         )
-    path, name = Path(path_or_name), str(path_or_name)
+    path = Path(path_or_name)
+    name = str(path_or_name)
     with suppress(RuntimeError):  # nobody of that name: take ~ as it stands
         path = path.expanduser()
     if not path.is_file():

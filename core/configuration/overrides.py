@@ -74,7 +74,8 @@ def _header_path(document: Document, parts: list[str]) -> Path:
         document.marks[("instrument", LIKE)] = document.mark(("instrument",))
     path: list[Any] = [*parts]
     for depth, part in enumerate(path[:-1], 1):
-        where, within = ".".join(parts[:depth]), parts[depth]
+        where = ".".join(parts[:depth])
+        within = parts[depth]
         if isinstance(here, dict) and part not in here and (depth == 1 or LIKE in here):
             if within.isdecimal():
                 raise _Refused(

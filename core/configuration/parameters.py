@@ -123,10 +123,8 @@ def without_a_type(
     error: Exception,
 ) -> ZondaError:
     """A class ``name`` of parameters, one of whose attributes pydantic cannot take."""
-    typed, kinds = (
-        namespace.get("__annotations__", {}),
-        (FunctionType, property, classmethod, staticmethod, type),
-    )
+    typed = namespace.get("__annotations__", {})
+    kinds = (FunctionType, property, classmethod, staticmethod, type)
     plain = {
         k: v
         for k, v in namespace.items()

@@ -109,7 +109,8 @@ class _Check(Mistakes):
         found: list[Diagnostic],
     ) -> None:
         super().__init__(document, folder, found)
-        self.name, self.band_unknown = name, False
+        self.name = name
+        self.band_unknown = False
         self.recorded_at: tuple[str, int] = (
             "operators",
             0,
@@ -209,7 +210,8 @@ class _Check(Mistakes):
         """Raise `ConfigurationError` for more steps (of an alias; those written are counted before)
         or entries than allowed.
         """
-        items, campaign = self.tree.get("operators"), self.tree.get("campaign")
+        items = self.tree.get("operators")
+        campaign = self.tree.get("campaign")
         many = isinstance(items, list) and len(items) > MOST_STEPS
         if many:
             at = self.document.mark(("operators",)).start

@@ -39,7 +39,8 @@ class Mistakes:
         folder: str | Path | None,
         found: list[Diagnostic],
     ) -> None:
-        self.document, self.found = document, found
+        self.document = document
+        self.found = found
         self.context = {"folder": folder}
 
     def wrong(self, message: str, span: Span, label: str = "", help: str = "") -> None:
@@ -139,24 +140,23 @@ def _step(mistakes: Mistakes, item: Any, at: Place) -> tuple[Step | None, Operat
     name: Any
     parameters: Any
     if isinstance(item, str):  # - BinMap
-        name, parameters, span, inner = item, {}, mistakes.document.mark(at).value, at
+        name = item
+        parameters = {}
+        span = mistakes.document.mark(at).value
+        inner = at
     elif isinstance(item, dict) and len(item) == 1:  # - BinMap: {pixel: 2 arcsec}
         name, parameters = next(iter(item.items()))
         inner = (*at, name)
         span = mistakes.document.mark(inner).start
         parameters = {} if parameters is None else parameters
     else:
-        message, span, label = (
-            "each step is one operator: '- Name: {...}'",
-            mistakes.document.mark(at).value,
-            "",
-        )
+        message = "each step is one operator: '- Name: {...}'"
+        span = mistakes.document.mark(at).value
+        label = ""
         if isinstance(item, dict) and item:
             second = list(item)[1]
-            span, label = (
-                mistakes.document.mark((*at, second)).start,
-                "indent this under the operator",
-            )
+            span = mistakes.document.mark((*at, second)).start
+            label = "indent this under the operator"
             message += f"; '{second}' may be indented too little"
         mistakes.wrong(message, span, label)
         return None, None

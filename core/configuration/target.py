@@ -208,7 +208,8 @@ class Target(TextValue):
 
     def __str__(self) -> str:
         """Text that parses back to the same bits."""
-        lon, lat = _text(self.longitude, wrap=True), _text(self.latitude)
+        lon = _text(self.longitude, wrap=True)
+        lat = _text(self.latitude)
         if self.frame == "horizontal":
             return f"az {lon} el {lat}"
         return f"{self.frame} {lon} {lat}"
@@ -266,7 +267,8 @@ def _read(value: Any, name: str, *, hours: bool) -> tuple[float, Literal["rad", 
     match = _DECIMAL.fullmatch(text)
     if match is None:
         raise mistake(f"cannot read {given}; write an angle such as '75 deg'")
-    number, unit = float(match["number"]), match["unit"].strip().lower()
+    number = float(match["number"])
+    unit = match["unit"].strip().lower()
     if not unit:
         raise mistake(
             f"{given} has no unit; write an angle such as '{text} deg'",
@@ -284,10 +286,12 @@ def _read(value: Any, name: str, *, hours: bool) -> tuple[float, Literal["rad", 
 
 
 def _sexagesimal(match: re.Match[str], name: str, *, hours: bool) -> float:
-    colons, given = match["mark"] == ":", f"{name} {match[0]!r}"
+    colons = match["mark"] == ":"
+    given = f"{name} {match[0]!r}"
     if colons and match["mark2"] not in (":", None):
         raise mistake(f"cannot read {given}; do not mix colons and letters")
-    minutes, seconds = float(match["minutes"]), float(match["seconds"] or 0)
+    minutes = float(match["minutes"])
+    seconds = float(match["seconds"] or 0)
     if minutes >= 60 or seconds >= 60:
         raise mistake(f"minutes and seconds of {given} must be below 60")
     whole = float(match["whole"])

@@ -40,8 +40,10 @@ def causes(err: Any, text: str) -> list[Cause]:
     says.
     """
     rows = text.splitlines() or [""]
-    problem, context = err.problem or "", err.context or ""
-    mark, start = err.problem_mark, err.context_mark
+    problem = err.problem or ""
+    context = err.context or ""
+    mark = err.problem_mark
+    start = err.context_mark
     if context == "while scanning a quoted scalar" and start is not None:
         label = (
             "close it; a quote within text is written twice"
@@ -380,7 +382,8 @@ class _TooLong(yaml.YAMLError):
 
     def __init__(self, key: Any, most: int) -> None:
         super().__init__(f"{key.value} has more than {most} items")
-        self.key, self.most = key, most
+        self.key = key
+        self.most = most
 
 
 def _too_deep(mark: Any) -> yaml.MarkedYAMLError:
@@ -401,7 +404,9 @@ _CLOSING = (yaml.SequenceEndEvent, yaml.MappingEndEvent)
 
 class _Reader:
     def __init__(self, source: Source, column: int, text: str) -> None:
-        self.source, self.column, self.text = source, column, text
+        self.source = source
+        self.column = column
+        self.text = text
         self.marks: dict[Path, Mark] = {}
         self.faults: list[Fault] = []
         self.flat: dict[int, list[tuple[Any, Any]]] = {}
@@ -421,13 +426,11 @@ class _Reader:
                     key = event
                 else:
                     listed = isinstance(event, yaml.SequenceStartEvent)
-                    items, limit = (
-                        0,
-                        (
-                            longest.get(getattr(key, "value", None) or "", math.inf)
-                            if listed
-                            else math.inf
-                        ),
+                    items = 0
+                    limit = (
+                        longest.get(getattr(key, "value", None) or "", math.inf)
+                        if listed
+                        else math.inf
                     )
             elif depth == 2 and not closes:
                 items += 1
@@ -447,8 +450,10 @@ class _Reader:
         return Document(value, self.marks, self.faults)
 
     def span(self, node: Any) -> Span:
-        a, b = node.start_mark, node.end_mark
-        shift, end_shift = (self.column if a.line == 0 else 0), (self.column if b.line == 0 else 0)
+        a = node.start_mark
+        b = node.end_mark
+        shift = self.column if a.line == 0 else 0
+        end_shift = self.column if b.line == 0 else 0
         return Span(self.source, a.line, a.column + shift, b.line, b.column + end_shift)
 
     def fault(self, err: yaml.YAMLError) -> None:
@@ -462,7 +467,8 @@ class _Reader:
             line, column = (mark.line, mark.column) if mark else (0, 0)
             column += self.column if line == 0 else 0
             if line >= len(rows):  # past the end
-                line, column = len(rows) - 1, len(rows[-1])
+                line = len(rows) - 1
+                column = len(rows[-1])
 
             found = causes(err, self.text)
             for cause in found:

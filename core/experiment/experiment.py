@@ -77,7 +77,10 @@ class Work(ABC, Generic[T, R]):
     """
 
     def __init__(self, pool: Pool, place: str, cure: str = "", retries: int = 2) -> None:
-        self.pool, self.place, self.cure, self.retries = pool, place, cure, retries
+        self.pool = pool
+        self.place = place
+        self.cure = cure
+        self.retries = retries
         self.stop = False
         """Set to begin no more of them."""
         self.attempts = Counter[T]()
@@ -103,7 +106,8 @@ class Work(ABC, Generic[T, R]):
             if self.attempts[item] <= self.retries:
                 return True
             error = PipelineError(f"the engine failed: {lost}", place=self.place, cure=self.cure)
-        self._error, self.stop = self._error or error, True
+        self._error = self._error or error
+        self.stop = True
         return False
 
     def carry_out(self, items: Sequence[T]) -> None:
@@ -119,14 +123,17 @@ class Work(ABC, Generic[T, R]):
         Exception
             The first that `again` found, when what was at work has ended.
         """
-        pool, waiting, suspects = self.pool, deque(items), deque[T]()
+        pool = self.pool
+        waiting = deque(items)
+        suspects = deque[T]()
         at_work: dict[Future[tuple[R, list[Warned]]], T] = {}
         ended: set[Future[tuple[R, list[Warned]]]] = set()
         try:
             while True:
                 batch: list[T] = []
                 for future in ended:
-                    item, result = at_work.pop(future), self._result(future)
+                    item = at_work.pop(future)
+                    result = self._result(future)
                     if self.ended(item, result):
                         (suspects if isinstance(result, Lost) else waiting).append(item)
                 room = pool.workers + pool.ahead - len(at_work)
@@ -240,7 +247,8 @@ class Experiment:
         threads: int | None = None,
     ) -> None:
         self.folder = None if folder is None else Path(folder)
-        self.say, self.threads = say, threads
+        self.say = say
+        self.threads = threads
         self.seeds = None if isinstance(seeds, int) else tuple(seeds)
         self.made = 0
         self._wanted: dict[AnyVariant, dict[str, int]] = {}
@@ -256,10 +264,12 @@ class Experiment:
         """Add a metric (None: `SECONDS`) of a variant at so many seeds. Raises `PipelineError`
         where it cannot have the metric.
         """
-        name, known = SECONDS, (v for v in self._wanted if v == variant)
+        name = SECONDS
+        known = (v for v in self._wanted if v == variant)
         variant = next(known, variant)
         if metric is not None:
-            whole, name = variant.variant.pipeline, str(metric)
+            whole = variant.variant.pipeline
+            name = str(metric)
             _measures(metric).check(whole.operators, whole.asked)
             self._metrics.setdefault(name, metric)
         metrics = self._wanted.setdefault(variant, {})
@@ -350,7 +360,8 @@ class Experiment:
     def keep(self, variant: AnyVariant, number: int, found: Found) -> None:
         """Keep what was measured, and write it to the file at once."""
         self.made += 1
-        kept, path = self._values(variant), self._path(variant)
+        kept = self._values(variant)
+        path = self._path(variant)
         kept[number] = {**kept.get(number, {}), **found}
         if path is not None and isinstance(variant, FileVariant):
             values = {
@@ -374,7 +385,8 @@ class _Runs(Work[Item, Found]):
     ) -> None:
         cure = "run it again on another executor; runs that a folder holds are not repeated"
         super().__init__(pool, "experiment", cure)
-        self.whole, self.missing = whole, missing
+        self.whole = whole
+        self.missing = missing
         self.place_of = {item: place for place, item in enumerate(items, 1)}
         self.take = take or whole.keep
 

@@ -80,8 +80,10 @@ class Variant:
         how
             Further arguments of `Pipeline.run`.
         """
-        whole, scene = self.pipeline, self.scene
-        steps, runs = list(self.steps(metrics) if operators is None else operators), whole.asked
+        whole = self.pipeline
+        scene = self.scene
+        steps = list(self.steps(metrics) if operators is None else operators)
+        runs = whole.asked
         for number, metric in enumerate(metrics):
             steps = metric.steps(steps)
             for name, signal in metric.signals(whole.asked).items():

@@ -38,7 +38,8 @@ from .planes import WHITE, noise_factor
 from .units import angle_of
 
 PARTS = 16
-MOST, FEW = 30, 5
+MOST = 30
+FEW = 5
 COMPLETE = 0.95
 """Least share of a circle that has values."""
 JANSKY = 1e6
@@ -142,7 +143,8 @@ def flux_within(
     map of noise alone in the unit of the map, and its name. Raises InputError where the map cannot
     be converted to Jy, or less than `COMPLETE` of the circle has values.
     """
-    grid, known = product.grid, product.known & np.isfinite(product.signal)
+    grid = product.grid
+    known = product.known & np.isfinite(product.signal)
     shown = product.to("MJy/sr", spectral_index=spectral_index)
     weights, missing = aperture.weights(grid, centre or product.centre, known)
     if missing > 1 - COMPLETE or not np.isfinite(weights).all():
@@ -152,13 +154,15 @@ def flux_within(
             place="aperture",
             cure="choose a smaller radius or another centre, or make a map with larger pixels",
         )
-    noise, used = shown.noise, weights != 0
+    noise = shown.noise
+    used = weights != 0
     if product.weighting == "inverse_variance":
         with np.errstate(divide="ignore"):
             noise = np.where(np.isfinite(noise), noise, shown.weights**-0.5)
     flux = JANSKY * float((weights[used] * shown.signal[used]).sum())
     error = JANSKY * math.sqrt(float(((weights[used] * noise[used]) ** 2).sum()))
-    factor, words = 1.0, WHITE
+    factor = 1.0
+    words = WHITE
     if alone is not None:
         both = product.with_planes(half_difference=alone[0])
         empty: Any = both.to("MJy/sr", spectral_index=spectral_index).half_difference
@@ -167,7 +171,8 @@ def flux_within(
         found = math.sqrt(np.mean(ratios**2)) if many else noise_factor(product.noise, alone[0])
         if found:
             where = f"{len(ratios)} apertures" if many else "single pixels"
-            factor, words = found, f"{where} on {alone[1]}"
+            factor = found
+            words = f"{where} on {alone[1]}"
     if not math.isfinite(error) or (product.smoothed_by and "apertures" not in words):
         factor, words = math.nan, "not known"  # pixels of smoothed maps are not independent
     return ApertureFlux(flux, factor * error, aperture.radius, missing, words)
@@ -177,7 +182,8 @@ def _ratios(product: Any, aperture: Aperture, noise: Floats, alone: Floats) -> F
     """Fluxes of noise ``alone`` over their errors by ``noise``, in circles beside each other, from
     the centre of the map outwards.
     """
-    grid, known = product.grid, np.isfinite(alone) & np.isfinite(noise)
+    grid = product.grid
+    known = np.isfinite(alone) & np.isfinite(noise)
     across = math.ceil(math.sqrt(MOST)) + 3
     x, y = (2 * aperture.radius * k for k in np.mgrid[-across : across + 1, -across : across + 1])
     order = np.argsort(np.hypot(x, y), axis=None, kind="stable")

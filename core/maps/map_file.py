@@ -69,7 +69,8 @@ class Provenance:
         """Provenance of a run whose scans are mapped: cards of its origin; the command and the
         resolved YAML as history. ``tables``: with these.
         """
-        scene, provenance = data.scene, data.provenance
+        scene = data.scene
+        provenance = data.provenance
         version = provenance.get("versions", {}).get("zonda") or versions()["zonda"]
         start = min((o.start for o in data.scans), default=scene.time)
         days = start.nanoseconds / (86400 * SECOND)

@@ -126,13 +126,15 @@ def map_axes(
     width, height, _ = _proportions(wcs, shape)
     strip = width > WIDE * height
     scale = min((LONG if strip else IMAGE) / width, IMAGE / height)
-    width, height = scale * width, scale * height
+    width = scale * width
+    height = scale * height
     if strip:
         below = BELOW + gap + BAR + BELOW
         step = 0.0, ABOVE + height + below
         size = LEFT + width + INNER, count * step[1]
     else:
-        below, step = BELOW, (width + gap + BAR + TEXT + INNER, 0.0)
+        below = BELOW
+        step = (width + gap + BAR + TEXT + INNER, 0.0)
         size = LEFT - INNER + count * step[0], ABOVE + height + below
     figure = Figure(dpi=DPI) if figure is None else figure
     figure.set_size_inches(*size)
@@ -142,7 +144,8 @@ def map_axes(
 
     axes = []
     for k in range(count):
-        x, y = LEFT + k * step[0], below + (count - 1 - k) * step[1]
+        x = LEFT + k * step[0]
+        y = below + (count - 1 - k) * step[1]
         ax = figure.add_axes(WCSAxes(figure, part(x, y, width, height), wcs=wcs))
         ax.inner = k > 0 and not strip
         beside = (x + width + gap, y, BAR, height)
@@ -177,9 +180,11 @@ def _label(ax: Any, shape: tuple[int, ...], stretched: float) -> None:
     names = [kind.split("-")[0].lower() for kind in wcs.wcs.ctype]
     frame = "as in the file"
     if names[0] == "glon":
-        names, frame = ["l", "b"], "Galactic"
+        names = ["l", "b"]
+        frame = "Galactic"
     elif names[0] == "ra":
-        names, frame = ["RA", "Dec"], wcs.wcs.radesys or "ICRS"
+        names = ["RA", "Dec"]
+        frame = wcs.wcs.radesys or "ICRS"
     more = f", {'' if stretched > 1 else names[1] + ' '}stretched "
     more += f"{max(stretched, 1 / stretched):.2g}×"
     ax.coords.grid(color="0.4", linewidth=0.6, alpha=0.7)
@@ -224,7 +229,8 @@ def draw_map(
     look.check("map.plot")
     if product.polarization is not None and plane in ("I", "Q", "U", "P"):
         return draw_map(product.stokes(plane), ax, "signal", title or plane, limit, look)
-    found, title = product.plane(plane), title or plane.replace("_", " ")
+    found = product.plane(plane)
+    title = title or plane.replace("_", " ")
     shown, wcs = on_plane(product, {plane: np.where(product.hits > 0, found.values[0], np.nan)})
     values = shown[plane]
     ax = notebook_axes(values.shape, wcs) if ax is None else ax
@@ -234,7 +240,8 @@ def draw_map(
     known = values[np.isfinite(values)]
     limits = float(known.min(initial=0.0)), limit or float(known.max(initial=0.0))
     unit = found.unit or found.fits_unit(product.unit)
-    colours, limits = look.colours or FAR, look.limits or limits
+    colours = look.colours or FAR
+    limits = look.limits or limits
     return plot_plain(values, wcs, limits, colours, unit, ax=ax, title=title, look=look)
 
 
@@ -290,7 +297,8 @@ def plot_map(
     if unit == "K_RJ":
         label = f"Rayleigh–Jeans brightness [{label}]"
     else:
-        factor, label = 1.0, f"brightness [{unit}]" if unit else "brightness"
+        factor = 1.0
+        label = f"brightness [{unit}]" if unit else "brightness"
     limits = (bottom * factor, top * factor)
     drawn = plot_plain(values * factor, wcs, limits, name, label, ax=ax, title=title, look=look)
     if fwhm:
@@ -341,9 +349,11 @@ def plot_coverage(
     norm: Any = Normalize(0, top)
     if top > 30 * middle:
         norm = LogNorm(min(max(float(used.min()), middle / 30), top / 2), top)
-    label, head = "samples per pixel", "Samples per pixel"
+    label = "samples per pixel"
+    head = "Samples per pixel"
     if per_beam is not None:
-        label, head = "integration time of all detectors [s per beam]", "Integration time per beam"
+        label = "integration time of all detectors [s per beam]"
+        head = "Integration time per beam"
     two = per_beam is not None and float(factor.max()) <= 1.01 * float(factor.min())
     ax = map_axes(hits.shape, wcs, gap=FAR_OFF if two else NEAR)[0]
     _show(ax, wcs, shown, label, title or head, "cividis", norm)
@@ -427,7 +437,8 @@ def range_of(values: AnyFloats, limit: float | None = None) -> tuple[float, floa
         else (0.0, 0.0)
     )
     if low == high and finite.size:  # a source of a few pixels
-        low, high = float(finite.min()), float(finite.max())
+        low = float(finite.min())
+        high = float(finite.max())
     limit = limit or max(abs(low), abs(high)) or 1.0
     if low * high > 0 and 0 < high - low < 0.5 * max(abs(low), abs(high)):
         return low, high, FAR
@@ -463,10 +474,8 @@ def _show(ax: Any, wcs: WCS, values: Any, label: str, title: str, colours: str, 
     )
     low, high = picture.get_clim()
     spare = 1e-6 * (high - low)  # of rounding
-    below, above = (
-        (values < low - spare).any() is np.True_,
-        (values > high + spare).any() is np.True_,
-    )
+    below = (values < low - spare).any() is np.True_
+    above = (values > high + spare).any() is np.True_
     place = getattr(ax, "bar_place", None)
     bar = ax.figure.colorbar(
         picture,
@@ -491,7 +500,9 @@ def _on_the_sky(ax: Any, wcs: WCS) -> Any:
     """World axes: ``ax`` itself, or new ones in the place of plain axes."""
     if hasattr(ax, "coords"):
         return ax
-    figure, place, spec = ax.figure, ax.get_position(), ax.get_subplotspec()
+    figure = ax.figure
+    place = ax.get_position()
+    spec = ax.get_subplotspec()
     ax.remove()
     if spec is None:
         return figure.add_axes(place, projection=wcs)
@@ -504,7 +515,8 @@ def draw_beam(ax: Any, wcs: WCS, shape: tuple[int, ...], fwhm: float) -> None:
     A map that is hardly larger than the beam has the width alone.
     """
     grid, (ny, nx) = wcs_grid(wcs, shape), shape
-    place, half = np.array([0.05 * nx, 0.05 * ny]), np.zeros(2)
+    place = np.array([0.05 * nx, 0.05 * ny])
+    half = np.zeros(2)
     for _ in range(2):  # its own size says where it lies
         beam = circle_on_sky(grid, place + half, fwhm, facecolor="white", edgecolor="black")
         half = np.array([beam.get_extents().width, beam.get_extents().height]) / 2
@@ -520,7 +532,8 @@ def draw_beam(ax: Any, wcs: WCS, shape: tuple[int, ...], fwhm: float) -> None:
 def draw_scale(ax: Any, wcs: WCS, shape: tuple[int, ...], length: float) -> None:
     """Draw a bar of ``length`` [rad] on the sky in the lower right corner, with its length."""
     grid, (ny, nx) = wcs_grid(wcs, shape), shape
-    end, y = 0.95 * nx, 0.06 * ny
+    end = 0.95 * nx
+    y = 0.06 * ny
     xx = float(grid.metric(0.8 * nx, y)[0])
     size = length / math.sqrt(xx if math.isfinite(xx) else grid.middle[0])
     ax.plot([end - size, end], [y, y], color="black", linewidth=2.5, zorder=5)
@@ -541,7 +554,8 @@ def circle_on_sky(grid: Any, place: Any, diameter: float, **style: Any) -> Any:
     turn = 0.5 * math.atan2(2 * xy, xx - yy)  # of the principal axis nearest to x
     if abs(turn) > math.pi / 4:
         turn -= math.copysign(math.pi / 2, turn)
-    c, s = math.cos(turn), math.sin(turn)
+    c = math.cos(turn)
+    s = math.sin(turn)
     along = xx * c * c + 2 * xy * c * s + yy * s * s
     across = xx * s * s - 2 * xy * c * s + yy * c * c
     sizes = diameter / math.sqrt(along), diameter / math.sqrt(across)

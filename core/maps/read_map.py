@@ -110,7 +110,8 @@ class _Reader(FileHeader):
     def __init__(self, hdu: Any, hdus: Any, place: str) -> None:
         check_size(hdu, place)
         super().__init__(hdu.header, place)
-        self.hdu, self.hdus = hdu, hdus
+        self.hdu = hdu
+        self.hdus = hdus
         self.rows: dict[str, tuple[NDArray[Any], str]] = {}
         self.where: dict[str, Any] = {}
 
@@ -149,7 +150,8 @@ class _Reader(FileHeader):
     def read_table(self, coordsys: str | None, column: int | str | None) -> None:
         """Read the columns of a HEALPix table."""
         table = HealpixTable(self.hdu, self.place)
-        names, pixel = table.names, table.pixel_column
+        names = table.names
+        pixel = table.pixel_column
         frame, _ = table.frame(coordsys)
         plain = {
             k: name.lower()
@@ -298,7 +300,8 @@ class _Reader(FileHeader):
             return given
         if given is not None:
             return registry.bands.create(given)  # type: ignore[no-any-return]
-        name, centre = self.text("BAND"), self.number("RESTFRQ") or 0.0
+        name = self.text("BAND")
+        centre = self.number("RESTFRQ") or 0.0
         camera, _, _ = self.text("INSTRUME").partition(" ")
         known: list[Band] = []
         if camera in registry.instruments:

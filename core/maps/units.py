@@ -82,7 +82,8 @@ def angle_of(given: Any, call: str) -> float:
     """Angle above 0 [rad] as text or quantity. Raises InputError for what is none; ``call``: how it
     is written.
     """
-    place, cure = call.partition("(")[0], f"write {call}"
+    place = call.partition("(")[0]
+    cure = f"write {call}"
     try:
         angle = Unit("rad").parse(given)
     except PydanticCustomError as err:

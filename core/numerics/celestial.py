@@ -110,8 +110,11 @@ class CelestialTransform:
         duration: float,
         tolerance: float = 1e-9,
     ) -> None:
-        self.site, self.start, self.duration = site, start, duration
-        self.source, self.orientation_known = "", True
+        self.site = site
+        self.start = start
+        self.duration = duration
+        self.source = ""
+        self.orientation_known = True
         self._theta0 = self._rotation_angle()
         self.spacing = NODE_SPACING
         for _ in range(8):
@@ -157,8 +160,10 @@ class CelestialTransform:
 
         Signs are such that neighbouring samples have neighbouring quaternions.
         """
-        n, upright = len(seconds), Upright()
-        azel, radec = series(4, n), series(4, n)
+        n = len(seconds)
+        upright = Upright()
+        azel = series(4, n)
+        radec = series(4, n)
         for part in chunks(n):
             now = self._interpolated(seconds[part])
             turn = conjugate(self._rotation(now, seconds[part]))
@@ -172,7 +177,8 @@ class CelestialTransform:
 
         ``icrs``: the unit vectors (m, 3) at a chunk of the ``seconds`` (n,).
         """
-        n, upright = len(seconds), Upright()
+        n = len(seconds)
+        upright = Upright()
         horizontal, azel, radec = (series(k, n) for k in (3, 4, 4))
         for part in chunks(n):
             now = self._interpolated(seconds[part])
@@ -195,7 +201,8 @@ class CelestialTransform:
             )  # "dubious year": leap seconds to come are unknown
             utc1, utc2 = self._utc(seconds)
             earth = orientation(utc1 - 2400000.5 + utc2)
-            self.source, self.orientation_known = earth.source, earth.known
+            self.source = earth.source
+            self.orientation_known = earth.known
             site = self.site
             # no refraction: pressure, temperature, humidity 0; the wavelength [um] then has no
             # effect
@@ -261,7 +268,10 @@ class CelestialTransform:
         """
         half = -(self._theta0 + self.site.longitude + SIDEREAL_RATE * seconds) / 2
         tilt = np.pi / 4 - self.site.latitude / 2
-        a, b, sine, cosine = np.sin(tilt), np.cos(tilt), np.sin(half), np.cos(half)
+        a = np.sin(tilt)
+        b = np.cos(tilt)
+        sine = np.sin(half)
+        cosine = np.cos(half)
         return np.stack([a * cosine, -a * sine, b * cosine, -b * sine]).T
 
     def _interpolated(self, seconds: Floats) -> _Nodes:
@@ -313,7 +323,8 @@ def _observed(icrs: Floats, now: _Nodes) -> Floats:
     """Deflection and aberration: ICRS unit vectors -> observed ones, BCRS axes."""
     import erfa
 
-    sun, distance = np.ascontiguousarray(now.sun[:, :3]), now.sun[:, 3]
+    sun = np.ascontiguousarray(now.sun[:, :3])
+    distance = now.sun[:, 3]
     reciprocal_gamma = np.sqrt(1 - np.einsum("ni,ni->n", now.velocity, now.velocity))
     bent = erfa.ldsun(icrs, sun, distance)
     observed: Floats = erfa.ab(bent, np.ascontiguousarray(now.velocity), distance, reciprocal_gamma)
@@ -324,11 +335,13 @@ def _natural(observed: Floats, now: _Nodes) -> Floats:
     """Inverse of `_observed`, a fixed point: errors shrink by 1e-4 per step, from those of one bend
     for all directions.
     """
-    middle, then = observed.mean(axis=0, keepdims=True), _Nodes(*(part[:1] for part in now))
+    middle = observed.mean(axis=0, keepdims=True)
+    then = _Nodes(*(part[:1] for part in now))
     middle = middle / (np.linalg.norm(middle) or 1.0)
     natural = observed - (_observed(middle, then) - middle)
     for _ in range(5):
-        before, natural = natural, observed - (_observed(_unit(natural), now) - natural)
+        before = natural
+        natural = observed - (_observed(_unit(natural), now) - natural)
         if np.abs(natural - before).max() < CONVERGED:
             break
     return _unit(natural)
@@ -379,7 +392,8 @@ class Orientation(NamedTuple):
 
 def orientation(mjd: Floats) -> Orientation:
     """Linear interpolation (as astropy's) at UTC modified Julian dates (n,), all from one table."""
-    first, last = int(np.floor(mjd.min())), int(np.floor(mjd.max())) + 1
+    first = int(np.floor(mjd.min()))
+    last = int(np.floor(mjd.max())) + 1
     for name, read in (
         ("IERS C04", _c04),
         ("IERS finals2000A, the latest values of which are predictions", _finals),
@@ -426,10 +440,8 @@ def _finals(first: int, last: int) -> Floats | None:
     from astropy_iers_data import IERS_A_FILE
 
     def fields(line: bytes) -> list[bytes]:
-        bulletin_a, bulletin_b = (
-            (line[18:27], line[37:46], line[58:68]),
-            (line[134:144], line[144:154], line[154:165]),
-        )
+        bulletin_a = (line[18:27], line[37:46], line[58:68])
+        bulletin_b = (line[134:144], line[144:154], line[154:165])
         return [
             line[7:15],
             *(bulletin_b if all(part.strip() for part in bulletin_b) else bulletin_a),

@@ -223,7 +223,8 @@ def _vector(builder: Any, pointer: Any, kind: Any, size: int = 8) -> Any:
 
 def _times(builder: Any, value: Any, size: int = 8) -> Any:
     """A vector of one number."""
-    nothing, lane = ir.Constant(ir.VectorType(value.type, size), ir.Undefined), ir.IntType(32)
+    nothing = ir.Constant(ir.VectorType(value.type, size), ir.Undefined)
+    lane = ir.IntType(32)
     first = builder.insert_element(nothing, value, lane(0))
     return builder.shuffle_vector(
         first,
@@ -234,7 +235,8 @@ def _times(builder: Any, value: Any, size: int = 8) -> Any:
 
 def _together(builder: Any, values: Any) -> Any:
     """Numbers in a vector, of which many are the same."""
-    size, lane = len(values), ir.IntType(32)
+    size = len(values)
+    lane = ir.IntType(32)
     found = ir.Constant(ir.VectorType(values[0].type, size), ir.Undefined)
     for value in {id(one): one for one in values}.values():
         places = ir.Constant(

@@ -150,7 +150,8 @@ def pixel_matrix(wcs: WCS) -> Floats:
     order of the axes and the frame are honoured (Calabretta & Greisen 2002). Raises InputError for
     other projections and for distortions.
     """
-    lng, lat = wcs.wcs.lng, wcs.wcs.lat
+    lng = wcs.wcs.lng
+    lat = wcs.wcs.lat
     kinds = [str(c) for c in wcs.wcs.ctype]
     if wcs.naxis != 2 or lng < 0 or lat < 0:
         cure = "set CTYPE1 and CTYPE2, e.g. RA---TAN and DEC--TAN"
@@ -221,13 +222,15 @@ def share_outside(
                 & (abs(x / depth - (nx - 1) / 2) <= nx / 2)
                 & (abs(y / depth - (ny - 1) / 2) <= ny / 2)
             )
-        beyond, looked = beyond + int(np.count_nonzero(~inside)), looked + inside.size
+        beyond = beyond + int(np.count_nonzero(~inside))
+        looked = looked + inside.size
     return beyond / looked if looked else 0.0
 
 
 def central(wcs: WCS) -> Floats:
     """`pixel_matrix` for directions in the frame of ``wcs`` itself."""
-    lng, lat = wcs.wcs.lng, wcs.wcs.lat
+    lng = wcs.wcs.lng
+    lat = wcs.wcs.lat
     lon0, lat0 = np.radians([wcs.wcs.crval[lng], wcs.wcs.crval[lat]])
     centre = np.array([np.cos(lat0) * np.cos(lon0), np.cos(lat0) * np.sin(lon0), np.sin(lat0)])
     east = np.array([-np.sin(lon0), np.cos(lon0), 0.0])

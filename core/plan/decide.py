@@ -24,7 +24,8 @@ SHARE = 0.1
 
 def limits(budget: float | Limits, map_noise: float, sample_noise: float) -> dict[str, float]:
     """Largest bound by metric. ``budget``: a share of the noise from 0 to 1, or `Limits`."""
-    stated, share = {}, SHARE
+    stated = {}
+    share = SHARE
     if isinstance(budget, Limits):
         stated = {metric: value for metric, value in budget if value is not None}
     else:

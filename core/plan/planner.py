@@ -69,7 +69,8 @@ def plan(
         For a name that is not in the plan, or a budget that is not a number from 0 to 1.
     """
     _check_arguments(file, keep, drop)
-    pipeline, scene = file.pipeline(), file.scene()
+    pipeline = file.pipeline()
+    scene = file.scene()
     labels = [o.label for o in pipeline.operators]
     structure = Structure.of_all(pipeline)
     if prune_all:
@@ -78,7 +79,8 @@ def plan(
     whole = [label for label in structure.operators if label in drop]
     remaining = _without(pipeline, structure, whole) if whole else structure
     names = [band.name for band in scene.instrument.bands] or [""]
-    threads, free = threads or available_threads(), memory or available_memory() // 2
+    threads = threads or available_threads()
+    free = memory or available_memory() // 2
     run = {"threads": threads, "files": files_of(free)}
     bands = {name: _in_band(name, file, drop, structure, remaining, run) for name in names}
     every = [d for band in bands.values() for d in band.decided]
@@ -222,7 +224,8 @@ def _everything_of(
     the operator."""
     bound = _contributes(label, estimates[label], context)
     for other in left.operators:
-        before, after = context.traits[other.label], left.traits[other.label]
+        before = context.traits[other.label]
+        after = left.traits[other.label]
         if (before.loudest, before.noise, before.rms) != (after.loudest, after.noise, after.rms):
             # two levels differ by less than the larger of them
             one = _contributes(other.label, estimates[other.label], context)

@@ -60,7 +60,8 @@ class PlanSummary:
         """The pipeline that is run: an ordinary one, with parameters changed and operators
         omitted. Each step keeps its label, which its random numbers depend on.
         """
-        steps, kept = [], []
+        steps = []
+        kept = []
         for o, step in zip(file.pipeline().operators, file.steps, strict=True):
             if o.label in self.operators:
                 update = dict(self.settings.get(o.label, {}))
@@ -153,7 +154,8 @@ class PlanOfBand:
         }
 
     def _effect(self, d: Decided) -> dict[str, Any]:
-        metrics, saves = self.limits, d.choice.saves
+        metrics = self.limits
+        saves = d.choice.saves
         return {
             "operator": d.operator,
             "effect": d.effect.name,
@@ -196,7 +198,8 @@ class PlanOfBand:
 
     def _noise(self) -> str:
         sample, pixel, hits = self.noise
-        coverage, plane = self.context.coverage, self.context.first.focalplane
+        coverage = self.context.coverage
+        plane = self.context.first.focalplane
         if not (pixel and coverage):
             return f"{kelvin(sample)} per sample; no map" if sample else "none"
         words = (
@@ -225,11 +228,13 @@ class PlanOfBand:
                 continue  # a statement
             if d.operator != before:
                 rows.append([d.operator])
-            before, saves = d.operator, d.choice.saves
+            before = d.operator
+            saves = d.choice.saves
             why = f"; saved {100 * saves.share:.2g} % of {saves.scene}" if saves else ""
             figures = (figure(m, bound[m]) if m in bound else "" for m in metrics)
             rows.append([f"  {d.effect.name}", d.choice.what, *figures, d.reason + why])
-        head, align = ["", "", *metrics], "<<" + ">" * len(metrics) + "<"
+        head = ["", "", *metrics]
+        align = "<<" + ">" * len(metrics) + "<"
         return [title, *aligned(rows, head, align)] if rows else []
 
 

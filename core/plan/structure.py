@@ -135,7 +135,8 @@ def _in_place_of_complete(
 ) -> str:
     """A signal whose components hold those of all other needed ones, where nothing reads what the
     complete one makes; else empty."""
-    signals, wanted = pipeline.signals, _wanted(pipeline, "")
+    signals = pipeline.signals
+    wanted = _wanted(pipeline, "")
     steps = [o for o in signals.steps if o.label in needed[""]]
     names = [name for name in needed if name]
     if (
@@ -186,7 +187,8 @@ def _walk(
     needed: set[str] = set()
     left_out: dict[str, str] = {}
     for k, operator in reversed([*enumerate(steps)]):
-        made, before = operator.provides, steps[:k]
+        made = operator.provides
+        before = steps[:k]
         names = " or ".join(sorted(made))
         if operator.label not in keep and not made & read:
             ends = MAIN in made and type(operator).finalize is not Operator.finalize
@@ -225,7 +227,8 @@ def steps_of(pipeline: Pipeline, name: str) -> list[Operator]:
     signals = pipeline.signals
     if not name:
         return signals.steps
-    signal, made = signals.all[name], signals.makers(name)
+    signal = signals.all[name]
+    made = signals.makers(name)
     return [
         o
         for o in signals.steps
@@ -270,7 +273,8 @@ def only(file: PipelineFile, components: Sequence[str]) -> PipelineFile:
         Where no step provides a component, or a step asks for singular modes of the complete data.
     """
     pipeline = file.pipeline()
-    signals, operators = pipeline.signals, pipeline.operators
+    signals = pipeline.signals
+    operators = pipeline.operators
     provided = sorted(signals.components)
     for name in components:
         if name not in provided:

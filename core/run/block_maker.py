@@ -59,9 +59,13 @@ class BlockMaker:
         stopped: Callable[[], bool],
     ) -> None:
         self._chain = chain = schedule.chain
-        self._view, self._observation, self._dtype = view, view.observation, schedule.settings.dtype
-        self._streams, self._schedule = schedule.streams, schedule
-        self._timer, self._stopped = timer, stopped
+        self._view = view
+        self._observation = view.observation
+        self._dtype = schedule.settings.dtype
+        self._streams = schedule.streams
+        self._schedule = schedule
+        self._timer = timer
+        self._stopped = stopped
         # the attributes of a step are slow to look up, and each piece needs them
         own = ((o, o.label) for o in view.chain.steps)
         self._own = {id(o): mine for o, mine in zip(chain.steps, own, strict=True)}
@@ -178,7 +182,8 @@ class BlockMaker:
         last = len(steps)
         while due is not None and last and id(steps[last - 1]) in self._joining:
             last -= 1
-        states, measured = self._view.states, self._view.measured
+        states = self._view.states
+        measured = self._view.measured
         for number, first in enumerate(steps):
             if self._stopped():
                 return
@@ -242,7 +247,9 @@ class BlockMaker:
         """Let a step act on a block, and check the streams that it leaves. A step that does not
         know of means is given a block with the means added.
         """
-        label, fields, seen = self._labels[id(step)], {}, block
+        label = self._labels[id(step)]
+        fields = {}
+        seen = block
         if names := self._declared.get(label, frozenset()) & block.detdata.keys():
             fields = means_of(self._observation, block.means, names)
         if fields:
@@ -279,7 +286,8 @@ class BlockMaker:
         With margins never in place: others read them too. Not ``copied``: steps work on copies of
         parts of it alone.
         """
-        source, observation = segment.source, self._observation
+        source = segment.source
+        observation = self._observation
         if again:
             observation = copy.copy(observation)
             observation.log = Log()
@@ -347,7 +355,9 @@ class BlockMaker:
         """Let steps that couple nothing work on copies of parts of a block; put the streams
         ``passed_on`` into it.
         """
-        given, means, made = block.detdata, block.means, dict[str, AnyFloats]()
+        given = block.detdata
+        means = block.means
+        made = dict[str, AnyFloats]()
         buffers = self._local.__dict__.setdefault("pieces", {})
         for detectors, samples in pieces(block.detectors, block.samples):
             piece = Block(

@@ -45,16 +45,20 @@ def at_end(views: Sequence[View], outputs: Sequence[Operator]) -> dict[str, int]
     """Bytes after the last scan, by what holds them: the products while they are finished, band
     after band, or finished ones with the outputs that act on them, whichever is more.
     """
-    each, pixels = list[tuple[int, int, int]](), 0
+    each = list[tuple[int, int, int]]()
+    pixels = 0
     for view in views:
         makers = [planning_of(o) for o in view.chain.steps if makes_products(o)]
         pixels = max([pixels, *(maker.pixels for maker in makers)])
         sizes = [(m.memory(view.observation), *m.finished(view.observation)) for m in makers]
         each.append((sum(s[0] for s in sizes), sum(s[1] for s in sizes), sum(s[2] for s in sizes)))
-    work, kept, before = 0, 0, sum(sums for sums, _, _ in each)
+    work = 0
+    kept = 0
+    before = sum(sums for sums, _, _ in each)
     for sums, finishing, product in each:
         work = max(work, kept + before - sums + finishing)
-        kept, before = kept + product, before - sums
+        kept = kept + product
+        before = before - sums
     acting = {o.label: planning_of(o) for o in outputs}
     parts = {label: planning.memory(views[0].observation) for label, planning in acting.items()}
     if acting:
@@ -96,7 +100,8 @@ def divide(
         Is turned off where there is no room for a scan that is prepared while another is executed.
     """
     groups = _groups(bands, settings, ahead)
-    least, threads = min(own.threads for _, own in groups), settings.threads
+    least = min(own.threads for _, own in groups)
+    threads = settings.threads
     for these, own in groups:
         for band in these:
             band.data.threads = own.threads
@@ -236,7 +241,8 @@ def least_memory(
     """Bytes with which a process runs a scan with these bands on one thread, libraries included;
     ``operators``: all steps.
     """
-    one, products = replace(settings, threads=1), memory_of(views, 1, products=True)
+    one = replace(settings, threads=1)
+    products = memory_of(views, 1, products=True)
     joined = any(map(joins, views[0].chain.steps))
     need = max(
         memory_of(group, 1)
@@ -255,7 +261,8 @@ def _refused(
     budget: int,
     settings: Settings,
 ) -> PipelineError:
-    need, free = sum(parts.values()), available_memory() + resident_memory()
+    need = sum(parts.values())
+    free = available_memory() + resident_memory()
     rows = sorted(parts.items(), key=lambda row: -row[1])
     largest = ", ".join(f"{who} {_size(size)}" for who, size in rows[:4] if size > 0.01 * need)
     cures = [f"use --memory {megabytes(need)}MB"] if need * 1.05 <= free else []

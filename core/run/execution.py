@@ -110,8 +110,11 @@ class Execution:
         before: Callable[..., None] = lambda **what: None,
         after: Callable[..., None] = lambda **what: None,
     ) -> None:
-        self.views, self.settings, self.timer = views, settings, timer
-        self._before, self._after = before, after
+        self.views = views
+        self.settings = settings
+        self.timer = timer
+        self._before = before
+        self._after = after
         self.beforehand: Future[None] | None = None
         self.schedule: Schedule
         self._makers: list[BlockMaker] = []
@@ -120,7 +123,8 @@ class Execution:
         self._store = Store(settings)
         self._made: dict[str, AnyFloats] = {}
         """Arrays of the streams that the segment at work passes on."""
-        self._source, self._begun = Source(), list[tuple[Operator, Observation]]()
+        self._source = Source()
+        self._begun = list[tuple[Operator, Observation]]()
         self._first = views[0].observation
         row = 0
         for number, view in enumerate(views):
@@ -271,7 +275,8 @@ class Execution:
 
     def _worked_through(self, segment: Segment) -> Source:
         """The streams that a segment passes on, once it has worked on all blocks."""
-        before, self._made = segment.source.arrays, self._room_for(segment)
+        before = segment.source.arrays
+        self._made = self._room_for(segment)
         found = Source(means={view.number: {} for view in self.views})
         working = (o for o in segment.operators if type(o).exec is not Operator.exec)
         labels = ", ".join(o.label for o in working)
@@ -292,7 +297,8 @@ class Execution:
         """Arrays for the streams that a segment passes on: new ones, or those that it changes in
         place.
         """
-        before, made = segment.source.arrays, dict[str, AnyFloats]()
+        before = segment.source.arrays
+        made = dict[str, AnyFloats]()
         for name in sorted(segment.wanted):
             if name in before and not segment.halo:
                 made[name] = before[name]
@@ -344,7 +350,8 @@ class Execution:
             for view, due in zip(views, every, strict=True):
                 self._of_band(segment, view, found, *part, due)
             for together in zip(*every, strict=True):
-                step, start = together[0].step, time.thread_time()
+                step = together[0].step
+                start = time.thread_time()
                 step.exec_bands([due.block for due in together], [due.state for due in together])
                 self.timer.add(step.label, "exec", time.thread_time() - start)
 
@@ -358,7 +365,8 @@ class Execution:
         due: list[Due] | None,
     ) -> None:
         """Let the steps act on a block of one band, and put what it passes on into ``found``."""
-        made, maker = self._made, self._makers[view.number]
+        made = self._made
+        maker = self._makers[view.number]
         block = maker.make(segment, detectors, samples, made, again=False, due=due)
         for name in made.keys() & block.detdata.keys():
             found.arrays[name] = made[name]
@@ -377,7 +385,8 @@ class Execution:
                     cure="keep a stream that a step provides",
                 )
             for view in self.views:
-                array, means = self._source.arrays[name][view.rows], self._source.means[view.number]
+                array = self._source.arrays[name][view.rows]
+                means = self._source.means[view.number]
                 view.observation.detdata.parts[name] = np.array(array), means.get(name)
                 forget_pages(array)
 
@@ -390,7 +399,8 @@ class Execution:
         step = next(o for o in views[0].chain.steps if o.label == label)
         for view in views:
             self._before(operator=step, observation=view.observation, stage="measure")
-        used, model = 0.0, None
+        used = 0.0
+        model = None
         for signal in self._measured_by(step):
             lent: list[AnyFloats] = []
             stream = self._stream(views, step, signal, lent)
@@ -410,7 +420,8 @@ class Execution:
 
     def _measured_by(self, step: Operator) -> list[Formed]:
         """The signals, or the one stream, that a step measures."""
-        here, signals = self._source.names, self.schedule.chain.signals
+        here = self._source.names
+        signals = self.schedule.chain.signals
         names = sorted(step.requires & here)
         if len(names) != 1:
             raise PipelineError(
@@ -431,9 +442,12 @@ class Execution:
         """A stream for a step that measures: under the name that it knows, with its own mean
         alone. ``lent`` takes the arrays that are to be given back.
         """
-        source, settings, held = self._source, self.settings, signal.stream
+        source = self._source
+        settings = self.settings
+        held = signal.stream
         name = MAIN if is_signal(held) else held
-        observation, means = views[0].observation, dict(source.means[views[0].number])
+        observation = views[0].observation
+        means = dict(source.means[views[0].number])
         if name == MAIN:
             means = {MAIN: means[held]} if held in means else {}
         if len(views) > 1:

@@ -105,9 +105,11 @@ class Schedule:
             Where the least one does not fit.
         """
         rows, columns = least_block(segment.whole, self.shape)
-        share, held = self._share(segment, segment.held), segment.held
+        share = self._share(segment, segment.held)
+        held = segment.held
         if rows * columns > share:
-            settings, need = self.settings, self._least_blocks(segment)
+            settings = self.settings
+            need = self._least_blocks(segment)
             raise PipelineError(
                 f"one block of {rows} detectors needs {need / settings.threads / 1e6:.1f} MB on"
                 f" each of {settings.threads} threads, the memory budget has"
@@ -127,7 +129,9 @@ class Schedule:
         self.segments = segments = cut(self.views)
         self.made_again = self._made_again(segments)
         apart = {s.stream for s in self.made_again}
-        source, held, elsewhere = Source(), 0, list[str]()
+        source = Source()
+        held = 0
+        elsewhere = list[str]()
         for number, segment in enumerate(segments):
             later, segment.source = segments[number + 1 :], source
             wanted = frozenset(self.chain.keep).union(
@@ -154,7 +158,8 @@ class Schedule:
             largest = max(self._largest_blocks(segment), smallest)
             self.bytes = max(self.bytes, held + size + largest)
             self.least = max(self.least, smallest)
-            held, source = segment.held, Source(names=segment.wanted)
+            held = segment.held
+            source = Source(names=segment.wanted)
         self.elsewhere = tuple(elsewhere)
 
     def _made_again(self, segments: Sequence[Segment]) -> tuple[Formed, ...]:
@@ -199,8 +204,10 @@ class Schedule:
         PipelineError
             Where they can neither be made again nor fit on the disk.
         """
-        following, disk = later[0], free_disk()
-        head, span = following.operators[0], segment.whole
+        following = later[0]
+        disk = free_disk()
+        head = following.operators[0]
+        span = segment.whole
         hindrance = ""
         if head.couples == "all" and not planning_of(head).sweeps(self.views[0].observation):
             hindrance = f"{head.label} reads it as a whole"
@@ -279,10 +286,12 @@ class Schedule:
             else set()
         )
         before = self._streams_in_block(segment.source.segment)
-        whole, part = len(names & self.streams), len(every & self.streams)
+        whole = len(names & self.streams)
+        part = len(every & self.streams)
         scratch = SCRATCH_STREAMS if rest else 0
         margins = 2 if segment.halo else 1  # a block with margins is trimmed to a copy
-        whole, part = margins * whole + scratch, part + (SCRATCH_STREAMS if first else 0)
+        whole = margins * whole + scratch
+        part = part + (SCRATCH_STREAMS if first else 0)
         return before[0] + whole + self._copies(rest), max(before[1], part + self._copies(first))
 
     def _copies(self, operators: Sequence[Operator]) -> int:

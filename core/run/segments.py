@@ -113,9 +113,11 @@ def cut(views: Sequence[View]) -> list[Segment]:
     """
     segments = [Segment([])]
     for steps in zip(*(view.chain.steps for view in views), strict=True):
-        operator, last = steps[0], segments[-1]
+        operator = steps[0]
+        last = segments[-1]
         each = [(o, view.observation) for o, view in zip(steps, views, strict=True)]
-        couples, halo = operator.couples, max(o.halo(seen) for o, seen in each)
+        couples = operator.couples
+        halo = max(o.halo(seen) for o, seen in each)
         in_order = any(planning_of(o).in_time_order(seen) for o, seen in each)
         apart = (in_order and last.span == "time") or (last.in_time_order and couples == "time")
         apart |= couples == "all"

@@ -28,7 +28,8 @@ from filelock import FileLock, Timeout
 from ..errors import OutputError
 from . import files
 
-RECORD, LOCK = "zonda-files.jsonl", ".zonda-lock"
+RECORD = "zonda-files.jsonl"
+LOCK = ".zonda-lock"
 LONGEST = 64_000_000
 """Bytes of a record that are read."""
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
@@ -45,7 +46,8 @@ def earlier(folder: Path, inputs: Iterable[Path] = ()) -> list[Path]:
     OutputError
         One of them was changed since, or the record is no regular file.
     """
-    root, kept = folder.resolve(), {os.path.realpath(path) for path in inputs}
+    root = folder.resolve()
+    kept = {os.path.realpath(path) for path in inputs}
     found = []
     for name, stamps in _read(folder).items():
         path = root / name
@@ -67,7 +69,8 @@ def clear(folder: Path, old: Iterable[Path]) -> None:
     """Remove files that `earlier` found and that were not changed since, the folders that this
     empties, and the record.
     """
-    root, stamps = folder.resolve(), _read(folder)
+    root = folder.resolve()
+    stamps = _read(folder)
     with files.writing(folder):
         for path in old:
             if not _unchanged(path, stamps.get(path.relative_to(root).as_posix(), set())):
@@ -121,7 +124,8 @@ class Record:
     """
 
     def __init__(self, folder: Path, old: list[Path] | None) -> None:
-        self.folder, self._old = Path(os.path.abspath(folder)), old
+        self.folder = Path(os.path.abspath(folder))
+        self._old = old
         self._new: set[str] = set()
         self._lock = threading.Lock()
 
@@ -130,7 +134,8 @@ class Record:
         path = Path(os.path.abspath(path))
         if not path.is_relative_to(self.folder):
             return
-        name, about = path.relative_to(self.folder).as_posix(), os.lstat(temporary)
+        name = path.relative_to(self.folder).as_posix()
+        about = os.lstat(temporary)
         line = json.dumps([name, about.st_size, about.st_mtime_ns]) + "\n"
         with self._lock:
             if self._old is not None and not self._new:

@@ -83,7 +83,9 @@ class AtmospherePlanning(Planning[AtmosphereLayers]):
         ),
         Knob("layers", (5, 10, 20), "thin sheets for a continuous atmosphere", redraws=True),
     )
-    holds, per_detector, per_sample = 10_000_000, 700, 40
+    holds = 10_000_000
+    per_detector = 700
+    per_sample = 40
 
     def memory(self, observation: Observation) -> int:
         """Tables, tiles of the turbulence, weights of the nodes; where there are none, the series
@@ -168,14 +170,18 @@ class Calibrated:
 @lru_cache(maxsize=2)
 def calibrated(model: AtmosphereModel) -> Calibrated:
     """See `Calibrated`."""
-    o, plane, step = model.observation, model.observation.focalplane, 1e-3
-    low, high = float(o.elevation.min()), float(o.elevation.max())
+    o = model.observation
+    plane = model.observation.focalplane
+    step = 1e-3
+    low = float(o.elevation.min())
+    high = float(o.elevation.max())
     # K of each detector: effect of a relative change of the PWV at the lowest elevation
     at = np.clip(low + plane.eta, ELEVATION_MIN, ELEVATION_MAX)
     passed = np.maximum(model.band.transmission(model.pwv, at), 1e-6)
     slope = abs(model.band.emission_difference(model.pwv, model.pwv * step, at)) / step
     gains = slope * plane.illumination_efficiency / (plane.main_beam_efficiency * passed)
-    largest, factors = float(gains.max()), model.strength(np.sin([low, high]))
+    largest = float(gains.max())
+    factors = model.strength(np.sin([low, high]))
     strongest = 1.0 if factors is None else max(1.0, float(factors.max()))
     speed = np.zeros((2, 1))  # of the boresight's crossing, per metre of height
     if o.n_samples > 1:
@@ -227,7 +233,8 @@ class AtmosphereBounds:
 
     def _differences(self, layers: list[Layer], whole: float) -> float:
         """Rms that is left of some layers, whose rms is ``whole``, without the common mode."""
-        a, plane = self.calibrated, self.context.first.focalplane
+        a = self.calibrated
+        plane = self.context.first.focalplane
         gains = math.hypot(a.uneven, *(t.gain_error for t in self.context.traits.values()))
         left = differential_rms(*spread_evenly(plane.xi, plane.eta), layers, a.model.plane.stretch)
         return math.hypot(a.kelvin * left, gains * whole)
@@ -236,7 +243,8 @@ class AtmosphereBounds:
         """Integral of the correlation over time, s: the beam or what of the outer scale the filters
         pass, over the wind's speed.
         """
-        speed, cut = max(float(np.hypot(*layer.wind)), 0.1), self.context.cut
+        speed = max(float(np.hypot(*layer.wind)), 0.1)
+        cut = self.context.cut
         slow = max(4 * layer.sigma, min(layer.outer_scale, 20 * layer.sigma)) / speed
         return min(slow, 1 / cut) if cut > 0 else slow
 
@@ -247,15 +255,18 @@ class AtmosphereBounds:
 
     def layers(self) -> list[Effect]:
         """Layers that may be omitted one by one."""
-        context, a = self.context, self.calibrated
-        p, what = a.model.parameters, "rms behind the beam"
+        context = self.context
+        a = self.calibrated
+        p = a.model.parameters
+        what = "rms behind the beam"
         if context.removes_common:
             what = "rms left of the layer after subtraction of the detectors' mean"
         text = f"1.25 p PWV dT/dPWV epsilon / (zeta e^-tau) kappa_l a_l x {what}"
         text += OTHER_MODES if context.turns else ""
         effects = []
         for k, layer in enumerate(a.layers):
-            bound, what = context.behind_modes(self.of_layers[k]), f"at {layer.height:.0f} m"
+            bound = context.behind_modes(self.of_layers[k])
+            what = f"at {layer.height:.0f} m"
             choices = [full(what + (": left out by the pipeline" if k in p.omit else ""))]
             if k not in p.omit and not p.outputs:
                 choices.append(Choice("dropped", "left out", {"omit": [k]}, False, bound, text))
@@ -265,8 +276,12 @@ class AtmosphereBounds:
     @cached_property
     def of_layers(self) -> list[dict[str, float]]:
         """Bound on each layer's part of the products."""
-        context, a, bounds = self.context, self.calibrated, []
-        model, low, step = a.model, a.elevations[0], 1e-3
+        context = self.context
+        a = self.calibrated
+        bounds = []
+        model = a.model
+        low = a.elevations[0]
+        step = 1e-3
         change = model.band.log_transmission_difference(model.pwv, model.pwv * step, low)
         slope = abs(float(change)) / step  # d ln <e^-tau> / d ln PWV
         for k, layer in enumerate(a.layers):
@@ -285,7 +300,9 @@ class AtmosphereBounds:
         """(n_layer,) largest share that each layer has of the stream's power in a range of
         frequency (20 from 1 / duration to Nyquist), white noise included.
         """
-        o, a, grid = self.context.first, self.calibrated, np.array([0.0, 1.0])
+        o = self.context.first
+        a = self.calibrated
+        grid = np.array([0.0, 1.0])
         if o.duration * o.sample_rate > 4:
             grid = np.geomspace(1 / o.duration, o.sample_rate / 2, 21)
         power = np.array([[a.faster(k, float(f)) ** 2 for f in grid] for k in range(len(a.layers))])
@@ -295,7 +312,8 @@ class AtmosphereBounds:
 
     def without(self) -> dict[str, float]:
         """Effect of dropping all layers; and the mean emission, if no filter takes it out."""
-        found, mean = add(*self.of_layers), self.context.mean_emission
+        found = add(*self.of_layers)
+        mean = self.context.mean_emission
         if not any(t.response for t in self.context.traits.values()):
             found = add(found, {"tod": mean, "map_rms": mean})
         return found
@@ -333,14 +351,16 @@ class AtmosphereBounds:
         """The band's spectrum and ozone: the fluctuation's error by radiative transfer at one
         frequency, and without O3.
         """
-        model, elevation = self.calibrated.model, self.calibrated.elevations[0]
+        model = self.calibrated.model
+        elevation = self.calibrated.elevations[0]
         band = self.context.first.instrument.band
         layers = replace(model.profile.layers, spectra=absorption_of(model.parameters))
         low, high = (f"{band.centre + side!r} Hz" for side in (-0.25e9, 0.25e9))
         middle = BandTransfer(Band(name="middle", low=low, high=high), layers)
         bare = BandTransfer(band, replace(layers, o3=np.zeros_like(layers.o3)))
         right = _slope(BandTransfer(band, layers), model.pwv, elevation)
-        cells, centre = "the band, in cells of 0.5 GHz", "at the band's centre alone"
+        cells = "the band, in cells of 0.5 GHz"
+        centre = "at the band's centre alone"
         return [
             exact(
                 name,
@@ -359,8 +379,10 @@ class AtmosphereBounds:
         """Emission and opacity over the elevations of the scan. The high-pass filter takes the mean
         emission out.
         """
-        context, model = self.context, self.calibrated.model
-        band, plane = model.band, context.first.focalplane
+        context = self.context
+        model = self.calibrated.model
+        band = model.band
+        plane = context.first.focalplane
         every = [o.elevation for o in context.observations]
         low = max(self.calibrated.elevations[0], math.radians(4.5))
         low = min(low, *(float(e.min()) for e in every))

@@ -29,8 +29,10 @@ PLANES = {
 
 def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     """The fluctuations of an observation, stated in its log."""
-    parameters, observation = model.parameters, model.observation
-    chosen, law = model.resolution(), model.fluctuation
+    parameters = model.parameters
+    observation = model.observation
+    chosen = model.resolution()
+    law = model.fluctuation
     law.check(model.pwv, label)
     turbulence = _layers_of(model, label)
     path = turbulence.paths[chosen.step]
@@ -38,7 +40,8 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     vapour_height = height_of_vapour(model)
     per_vapour = delay_per_vapour(np.asarray(model.profile.at(model.heights).temperature), shares)
     top = model.band.pwv_max / model.pwv - 1
-    sines, terms = (path.low, path.high), model.terms((path.low, path.high))
+    sines = (path.low, path.high)
+    terms = model.terms((path.low, path.high))
     names = streams(parameters.outputs)
     response = Response(
         model.band,
@@ -56,11 +59,14 @@ def draw(model: AtmosphereModel, label: str) -> AtNodes | OfDetectors:
     def pwv(g: Floats, weighted: Floats, sine: Floats, own: slice) -> tuple[Floats, Floats]:
         strength = model.strength(sine)
         if strength is not None:
-            g, weighted = g * strength, weighted * strength
-        y, count = law(g), 0
+            g = g * strength
+            weighted = weighted * strength
+        y = law(g)
+        count = 0
         if y.min() < -1 or y.max() > top:
             clipped = np.clip(y, -1.0, top)
-            count, y = int((clipped != y)[:, own].sum()), clipped
+            count = int((clipped != y)[:, own].sum())
+            y = clipped
         observation.log.count(label, "values of the PWV clipped to the table", count)
         return y, weighted
 
@@ -108,7 +114,8 @@ def _of_bands(models: Sequence[AtmosphereModel], label: str) -> dict[str, Drifti
     """Layers by name of the band's scan."""
     layers = [drifting_layers(model) for model in models]
     for model, others in zip(models, share_tiles(layers), strict=True):
-        whole, text = len(model.simulated), "lattices of its own: other beams or directions"
+        whole = len(model.simulated)
+        text = "lattices of its own: other beams or directions"
         named = ((models[k].observation.instrument.band.name, n) for k, n in sorted(others.items()))
         if parts := ", ".join(f"{name} ({n} of {whole} layers)" for name, n in named):
             text = f"lattices made once with those of {parts}"
@@ -131,7 +138,8 @@ def drifting_layers(
     ]
     first, count = times(slice(0, model.observation.n_samples), chosen.step)
     kind = np.float64 if chosen.nodes.shape else np.float32
-    points, span = points or (chosen.nodes.xi, chosen.nodes.eta), (first, first + count)
+    points = points or (chosen.nodes.xi, chosen.nodes.eta)
+    span = (first, first + count)
     return DriftingLayers(model.observation, model.plane, points, drifting, chosen.step, span, kind)
 
 
@@ -167,7 +175,8 @@ def bytes_of_units(model: AtmosphereModel) -> int:
 
 def _units(model: AtmosphereModel) -> tuple[int, int, int, int]:
     """Detectors, samples, step and streams of the units."""
-    o, names = model.observation, streams(model.parameters.outputs)
+    o = model.observation
+    names = streams(model.parameters.outputs)
     return o.n_detectors, o.n_samples, model.resolution().step, len(names)
 
 
@@ -220,11 +229,14 @@ def _of_the_pwv(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
 
 
 def _of_the_beam(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[str, str]]:
-    layers, fields, footprint = model.layers, model.turbulence, model.parameters.beam
+    layers = model.layers
+    fields = model.turbulence
+    footprint = model.parameters.beam
     sizes = (f"{field.sigma:.3g} m / {field.spacing:g} m" for field in fields)
     yield "beam sigma / lattice spacing, per layer", ", ".join(dict.fromkeys(sizes))
     instrument = model.observation.instrument
-    diameter, wavelength = instrument.telescope.diameter, SPEED_OF_LIGHT / instrument.band.centre
+    diameter = instrument.telescope.diameter
+    wavelength = SPEED_OF_LIGHT / instrument.band.centre
     sines = math.sin(model.plane.elevation) / np.array([path.high, path.low])
     ends = [widened(diameter, wavelength, layers[-1].distance * k) for k in (*sines, 1.0)]
     text = (
@@ -248,7 +260,8 @@ def _of_the_beam(model: AtmosphereModel, path: LinesOfSight) -> Iterator[tuple[s
 
 
 def _of_the_resolution(model: AtmosphereModel) -> Iterator[tuple[str, str]]:
-    chosen, plane = model.resolution(), model.plane
+    chosen = model.resolution()
+    plane = model.plane
     error = (
         f"; expected rms error {chosen.focal_plane_error:.1e} of the fluctuation"
         if chosen.nodes.shape

@@ -93,20 +93,20 @@ class LayerTerms:
         """Compute the terms of layers at ``heights`` (n_layer,) above the site [m]; ``scale``: y /
         sum_l a_l g_l.
         """
-        low, high = (
-            max(sines[0], math.sin(ELEVATION_MIN) * (1 + 1e-12)),
-            min(sines[1], math.sin(ELEVATION_MAX)),
-        )
+        low = max(sines[0], math.sin(ELEVATION_MIN) * (1 + 1e-12))
+        high = min(sines[1], math.sin(ELEVATION_MAX))
         looked_at = np.cos(np.linspace(0, math.pi, LOOKED_AT))
         points = [chebyshev_points(n + 1) for n in TERM_DEGREES]
         places = np.concatenate([looked_at, *points])
         s = (low + high) / 2 + places * (high - low) / 2
         water = band.transfer.of_water(pwv, np.arcsin(np.clip(s, low, high)).tolist())
-        weights, degrees = [], []
+        weights = []
+        degrees = []
         for name in NAMES:
             own = pwv * s[:, None] * water.at(name, heights)
             excess = own - pwv * s[:, None] * water.of_column(name)[:, None]
-            truth, first = excess[:LOOKED_AT], LOOKED_AT
+            truth = excess[:LOOKED_AT]
+            first = LOOKED_AT
             for degree, known in zip(TERM_DEGREES, points, strict=True):
                 matrix = np.linalg.inv(np.vander(known, degree + 1, increasing=True))
                 found = matrix @ excess[first : first + degree + 1]
@@ -207,7 +207,8 @@ class Response:
         self._range = y_low, y_high = y_range
         bottom, top = np.sin(ELEVATION_MIN) * (1 + 1e-12), np.sin(ELEVATION_MAX)
         self._y = ((y_low + y_high) / 2, 2 / max(y_high - y_low, 1e-9))
-        low, high = max(sines[0], bottom), min(sines[1], top)
+        low = max(sines[0], bottom)
+        high = min(sines[1], top)
         self._s = ((low + high) / 2, 2 / max(high - low, 1e-9))
 
         def elevation(

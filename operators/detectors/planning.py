@@ -48,7 +48,8 @@ class TimeConstantPlanning(Planning[TimeConstant]):
         """Error of leaving the step out, of a point source: 1 - |H| at the highest frequency of a
         beam that passes.
         """
-        o, tau = context.first, self.operator.tau
+        o = context.first
+        tau = self.operator.tau
         speed = context.coverage.speed if context.coverage else 0.0
         # a Gaussian of FWHM passes to 1 % of its power below 0.71 v / FWHM
         frequency = min(0.71 * speed / float(o.focalplane.fwhm.min()), o.sample_rate / 2)

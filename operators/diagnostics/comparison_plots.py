@@ -46,12 +46,15 @@ def draw_comparison(file: str, found: Comparison, contours: Sequence[float] = ()
 
 
 def _maps(file: str, found: Comparison) -> Sketch:
-    planes, where, f = found.planes, wcs_of(found.header), found.values
+    planes = found.planes
+    where = wcs_of(found.header)
+    f = found.values
     axes = map_axes(planes["map"].shape, where, 3)
     both = np.stack([planes["reference"], planes["map"]])
     known = both[np.isfinite(both)]
     low, high, colours = range_of(known, float(np.percentile(np.abs(known), 99.7)))
-    same, away = Look(colours, (low, high)), planes["difference"]
+    same = Look(colours, (low, high))
+    away = planes["difference"]
     most = float(np.percentile(np.abs(away[np.isfinite(away)]), SHOWN)) or 1.0
     reference, other = found.names
     style: dict[str, Any] = {"fwhm": found.fwhm or None, "unit": found.unit}
@@ -72,8 +75,10 @@ def _maps(file: str, found: Comparison) -> Sketch:
 
 
 def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
-    planes, where = found.planes, wcs_of(found.header)
-    snr, fidelity = planes.get("snr"), planes["fidelity"]
+    planes = found.planes
+    where = wcs_of(found.header)
+    snr = planes.get("snr")
+    fidelity = planes["fidelity"]
     axes = map_axes(fidelity.shape, where, 1 if snr is None else 2)
     finite = fidelity[np.isfinite(fidelity)]  # infinite where maps are equal
     most = (min(MOST_FIDELITY, float(np.percentile(finite, 99.9))) if finite.size else 0.0) or 1.0
@@ -82,7 +87,8 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
     if snr is not None:
         reached = [abs(level) for level in levels if (snr * np.sign(level) >= abs(level)).any()]
         top = float(math.ceil(max(float(np.nanpercentile(np.abs(snr), 99.9)), *reached, 1.0)))
-        words, name = found.noise["snr"][0], "signal-to-noise ratio"
+        words = found.noise["snr"][0]
+        name = "signal-to-noise ratio"
         title = f"Signal-to-noise ratio, {noise_text(words, short=True)}"
         plot_plain(snr, where, (-top, top), "RdBu_r", name, ax=axes[1], title=title)
         plot_contours(axes[1], snr, levels)
@@ -94,9 +100,11 @@ def _quality(file: str, found: Comparison, levels: Sequence[float]) -> Sketch:
 def _curves(file: str, found: Comparison) -> Sketch:
     left, right = new_axes((10.6, 4.9), above=0.9, ncols=2, gridspec_kw={"wspace": 0.25})
     plot_radial_spectra(left, found.spectra, found.unit, found.fwhm)
-    p, names = found.profiles, dict(zip(("reference", "map"), found.names, strict=True))
+    p = found.profiles
+    names = dict(zip(("reference", "map"), found.names, strict=True))
     used = np.isfinite(p.mean["map"])
-    factor, unit = 1.0, found.unit
+    factor = 1.0
+    unit = found.unit
     if unit == "K_RJ":
         peaks = (float(np.abs(mean[used]).max(initial=0.0)) for mean in p.mean.values())
         factor, unit = unit_of(max(peaks))
@@ -128,25 +136,32 @@ def plot_radial_spectra(
     """Power spectral densities against the angular scale, log-log; shaded: standard errors; dashed:
     the white level.
     """
-    scale, values = found.scale / ARCSEC, []
+    scale = found.scale / ARCSEC
+    values = []
     error = 1 / np.sqrt(np.maximum(found.modes, 1.0))
     for k, (name, power) in enumerate(found.power.items()):
         good = np.isfinite(power) & (power > 0)
-        x, y, e = scale[good], power[good] / ARCSEC**2, error[good]
-        colour, label = SEQUENCE[k % len(SEQUENCE)], (names or {}).get(name, name)
+        x = scale[good]
+        y = power[good] / ARCSEC**2
+        e = error[good]
+        colour = SEQUENCE[k % len(SEQUENCE)]
+        label = (names or {}).get(name, name)
         ax.plot(x, y, "o-", color=colour, linewidth=1.4, markersize=3, label=label)
-        low, high = y * np.maximum(1 - e, 0.05), y * (1 + e)
+        low = y * np.maximum(1 - e, 0.05)
+        high = y * (1 + e)
         ax.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
         values.append(y)
         if name in found.white:
             known = np.isfinite(found.white[name])
-            x, y = scale[known], found.white[name][known] / ARCSEC**2
+            x = scale[known]
+            y = found.white[name][known] / ARCSEC**2
             ax.plot(x, y, "--", color=colour, linewidth=1.0, label=f"white level of {name}")
             values.append(y)
     for name, power in found.cross.items():
         if name.endswith("_TE"):
             good = np.isfinite(power) & (power != 0)
-            x, y = scale[good], np.abs(power[good]) / ARCSEC**2
+            x = scale[good]
+            y = np.abs(power[good]) / ARCSEC**2
             ax.plot(x, y, ":", color="0.4", linewidth=1.2, label=f"|{name}|")
     ax.set_xscale("log")
     ax.set_yscale("log")

@@ -20,7 +20,8 @@ class PlotsPlanning(Planning[Plots]):
     """matplotlib and the pictures."""
 
     of = Plots
-    holds, per_pixel = 90_000_000, 112
+    holds = 90_000_000
+    per_pixel = 112
 
 
 class ReportPlanning(Planning[Report]):
@@ -96,7 +97,8 @@ class CompareStreamsPlanning(Planning[Any]):
         """Segments of a detector and their transforms, and the spectra of all."""
         from .compare_streams import LEAST_SEGMENTS
 
-        step, n = self.operator, observation.n_samples
+        step = self.operator
+        n = observation.n_samples
         count: int = min(observation.n_detectors, step.detectors)
         length: float = min(n / LEAST_SEGMENTS, step.segment * observation.sample_rate)
         return round(16 * n + (64 + 16 * count) * length)

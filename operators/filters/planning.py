@@ -47,7 +47,8 @@ class HighpassPlanning(Planning[HighpassFilter]):
     def traits(self, observation: Observation) -> Traits:
         """A brick wall; a scan shorter than one cycle loses only a line. Of the Bessel filter, what
         passes a hundredth counts as passed."""
-        frequency, rate = self.operator.frequency, observation.sample_rate
+        frequency = self.operator.frequency
+        rate = observation.sample_rate
         if self.operator.response == "bessel" and frequency < rate / 2:
             tried = np.geomspace(1e-3, 1, 200) * frequency
             cut = tried[np.argmax(amplitude(tried, frequency, rate) >= 0.01)]  # the last, 0.7, is
@@ -59,10 +60,13 @@ class HighpassPlanning(Planning[HighpassFilter]):
         """The error of fewer knots; the Bessel filter has none."""
         if self.operator.response == "bessel":
             return Estimate()
-        o, cut, full_q = context.first, self.operator.frequency, self.operator.oversampling
+        o = context.first
+        cut = self.operator.frequency
+        full_q = self.operator.oversampling
         choices = [full(f"{full_q:g} knots per cycle of the cut")]
         if (q := COARSE_KNOTS) < full_q:
-            low, both = low_part(context, cut), (q, full_q)
+            low = low_part(context, cut)
+            both = (q, full_q)
             error = LEAKS * sum(
                 math.hypot(low * images(x)[0], aliased(context, cut, x)) for x in both
             )
@@ -88,7 +92,8 @@ def images(q: float) -> tuple[float, float]:
     """rms and sum of the amplitudes of the two images that a coarse series of ``q`` knots per cycle
     of the cut makes of a cosine at the cut: sinc(k / 2M)^4 at 2M -+ k over that at k is (k / (2M -+
     k))^4 = (q -+ 1)^-4."""
-    below, above = (q - 1) ** -4, (q + 1) ** -4
+    below = (q - 1) ** -4
+    above = (q + 1) ** -4
     return math.hypot(below, above), below + above
 
 
@@ -133,7 +138,8 @@ class DetrendPlanning(Planning[Any]):
         """Bytes: the polynomials, and a row in float64; with a mask, its pointing, and where some
         rows are in it.
         """
-        masked, order = 3 + 2.5 * ROWS if self.operator.mask else 0.0, self.operator.order
+        masked = 3 + 2.5 * ROWS if self.operator.mask else 0.0
+        order = self.operator.order
         return math.ceil(8 * (float(order) + 5 + masked) * observation.n_samples)
 
 
@@ -205,7 +211,8 @@ class CommonModePlanning(Planning[CommonModeFilter]):
         """Series over the scan: one for each step of the iteration, or the sums of
         `common_mode.read_mean`.
         """
-        n_det, n_samp = observation.n_detectors, observation.n_samples
+        n_det = observation.n_detectors
+        n_samp = observation.n_samples
         if self.operator.method == "mean":
             return 8 * 8 * n_samp + 100 * n_det
         return 8 * (20 + 8 * self.operator.modes) * n_samp + 200 * n_det

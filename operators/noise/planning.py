@@ -57,7 +57,9 @@ class PinkPlanning(Planning[PinkNoise]):
 
     def memory(self, observation: Observation) -> int:
         """Filter states that are kept, and the common part."""
-        pink, n_det, n_samp = self.operator, observation.n_detectors, observation.n_samples
+        pink = self.operator
+        n_det = observation.n_detectors
+        n_samp = observation.n_samples
         kept = -(-n_det // TILE_DETECTORS) * (n_samp // CHECKPOINT + 3)
         common = 12 * n_samp if pink.shared > 0 else 0
         if spectrum := PinkSpectrum.of(pink, observation):
@@ -87,11 +89,13 @@ class PinkPlanning(Planning[PinkNoise]):
 
     def estimate(self, context: Context) -> Estimate:
         """Error of leaving the step out."""
-        pink, o = self.operator, context.lowest
+        pink = self.operator
+        o = context.lowest
         spectrum = PinkSpectrum.of(pink, o)
         if spectrum is None:
             return Estimate()
-        law, traits = spectrum.filter(pink.poles), self.traits(o)
+        law = spectrum.filter(pink.poles)
+        traits = self.traits(o)
         level = self._amplitude(spectrum, o) ** 2 / max(context.noise, 1e-30) ** 2
         assert traits.faster is not None
         passed = LEAKS * traits.faster(context.cut) if context.cut > 0 else traits.rms
@@ -105,7 +109,8 @@ class PinkPlanning(Planning[PinkNoise]):
             " high-pass filter"
         )
         text += OTHER_MODES if context.turns else ""
-        bound, choices = context.behind_modes(size), [full(f"{pink.poles} poles")]
+        bound = context.behind_modes(size)
+        choices = [full(f"{pink.poles} poles")]
         if pink.shared == 0 and not context.kept_streams & pink.provides:
             # a common part would be what a singular mode consists of: it is not dropped
             choices.append(Choice("dropped", "none", leave_out=True, bound=bound, formula=text))
@@ -143,7 +148,8 @@ def _correlated(law: PowerLawFilter, context: Context) -> float:
     """
     if context.cut <= 0:
         return context.first.duration
-    cut, rate = context.cut, context.first.sample_rate
+    cut = context.cut
+    rate = context.first.sample_rate
     n = 4096
     f = np.arange(n + 1) * cut / 16
     power = np.where((f >= cut) & (f <= rate / 2), law.response(np.maximum(f, cut) / rate), 0.0)

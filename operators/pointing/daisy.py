@@ -45,8 +45,10 @@ class PointingDaisy(Pointing):
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
         phi = self.phase + self.speed * seconds / self.radius
-        outer, inner = np.sin(phi), self.inner * np.cos(phi)
-        slow, fast = phi / self.petals, math.sqrt(2) * phi / self.petals
+        outer = np.sin(phi)
+        inner = self.inner * np.cos(phi)
+        slow = phi / self.petals
+        fast = math.sqrt(2) * phi / self.petals
         x = self.radius * (outer * np.cos(slow) + inner * np.cos(fast))
         y = self.radius * (outer * np.sin(slow) + inner * np.sin(fast))
         return x, y

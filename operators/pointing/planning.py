@@ -58,13 +58,16 @@ class PointingPlanning(Planning[Pointing | PointingRecorded | PointingSchedule])
 
     def estimate(self, context: Context) -> Estimate:
         """Each effect by the shift of the beam that it makes."""
-        o, error = context.first, self.operator.interpolation_error
-        fwhm, radius = float(o.focalplane.fwhm.min()), o.focalplane.radius
+        o = context.first
+        error = self.operator.interpolation_error
+        fwhm = float(o.focalplane.fwhm.min())
+        radius = o.focalplane.radius
         speed = context.coverage.speed if context.coverage else _speed(o)
         seen = [_thin(x) for x in context.observations]
         turn = max(float(np.ptp(np.unwrap(x.derotate("boresight_radec")[2]))) for x in seen)
         smear = (speed / o.sample_rate) ** 2 / 24 * 8 * math.log(2) / fwhm**2
-        aberration, per_beam = ABERRATION * _extent(context, seen), "1.43 / FWHM x "
+        aberration = ABERRATION * _extent(context, seen)
+        per_beam = "1.43 / FWHM x "
         effects = (
             not_simulated(
                 "refraction",

@@ -87,7 +87,8 @@ class MapHeader(FileHeader):
 
     def __init__(self, header: Any, place: str, wanted: Wanted, notes: dict[str, str]) -> None:
         super().__init__(header, place)
-        self.wanted, self.notes = wanted, notes
+        self.wanted = wanted
+        self.notes = notes
 
     def refuse(self, message: str, **options: object) -> None:
         """Raise InputError if one of the ``options`` is given, which ``message`` names."""
@@ -101,7 +102,8 @@ class MapHeader(FileHeader):
         ``others``: units of Q and U, which are ``what`` in the file. Raises InputError if they are
         not that of I.
         """
-        written, wanted = self.text(key), self.wanted.unit
+        written = self.text(key)
+        wanted = self.wanted.unit
         if self.wanted.temperature:
             for unit, joule in (("J", 1.0), ("K", BOLTZMANN)):
                 if written and (factor := factor_to(unit, written)):
@@ -134,7 +136,8 @@ class MapHeader(FileHeader):
 
         Raises InputError where a map in Jy/beam has none.
         """
-        given, needed = self.wanted.input_beam, unit == "Jy/beam"
+        given = self.wanted.input_beam
+        needed = unit == "Jy/beam"
         if given is not None:
             if not needed:
                 message = f"input_beam is for maps in Jy/beam, and this one is in {unit}"
@@ -199,7 +202,8 @@ class MapHeader(FileHeader):
         Raises InputError if the header has an unknown POLCCONV; or if an ``image`` has none, and
         none is wanted.
         """
-        written, given = self.text("POLCCONV").upper(), self.wanted.convention
+        written = self.text("POLCCONV").upper()
+        given = self.wanted.convention
         if given is None and written not in ("COSMO", "IAU", ""):
             raise self.error(
                 f"POLCCONV = '{written}' is neither COSMO nor IAU",
@@ -260,7 +264,8 @@ def odd_pixels(sides: Floats, shape: tuple[int, ...], beam: float) -> str:
     ``sides`` (2,): of a pixel [rad]; ``shape``: (ny, nx); ``beam``: FWHM [rad].
     """
     x, y = (float(side) / ARCSEC for side in sides)
-    across, fwhm = max(x * shape[1], y * shape[0]), beam / ARCSEC
+    across = max(x * shape[1], y * shape[0])
+    fwhm = beam / ARCSEC
     text = f"its pixels are {x:.4g} x {y:.4g} arcsec"
     cure = "are CDELT1 and CDELT2 in degrees?"
     if across < fwhm:
@@ -289,7 +294,8 @@ def seen_twice(
     simulated = own if given is None else given
     major, minor = (math.hypot(simulated, b) for b in beam)
     result = math.sqrt(major * minor)
-    was, now = angle_text(math.sqrt(beam[0] * beam[1])), angle_text(result)
+    was = angle_text(math.sqrt(beam[0] * beam[1]))
+    now = angle_text(result)
     seen = angle_text(simulated)
     text = f"made with a beam of {was} (BMAJ), convolved with one of {seen}: {now} in all"
     share = (simulated / result) ** 2

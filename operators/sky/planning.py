@@ -56,7 +56,8 @@ def chromaticity(band: Band) -> float:
     """Relative change of a point source's peak where FWHM ~ 1 / nu: |<(nu / nu_0)^2> - 1| over the
     band.
     """
-    nu, t = band.frequency, band.transmission
+    nu = band.frequency
+    t = band.transmission
     return abs(float(np.trapezoid(t * (nu / band.centre) ** 2, nu) / np.trapezoid(t, nu)) - 1)
 
 
@@ -95,7 +96,8 @@ class SkyPlanning(Planning[SkyMap]):
 
     def traits(self, observation: Observation) -> Traits:
         """Largest brightness of the map before the beam."""
-        sky, band = self.operator, observation.instrument.band
+        sky = self.operator
+        band = observation.instrument.band
         grid = sky.grid_of(observation)
         if not grid.reached(observation, self._widest(observation)):
             return Traits(peak=abs(sky.outside))
@@ -112,12 +114,17 @@ class SkyPlanning(Planning[SkyMap]):
 
     def estimate(self, context: Context) -> Estimate:
         """Each effect as a share of a point source's peak."""
-        o, step, widest = context.first, self.operator, self._widest(context.first)
-        fwhm, what = 0.0, "not convolved: no detector reaches the map"
+        o = context.first
+        step = self.operator
+        widest = self._widest(context.first)
+        fwhm = 0.0
+        what = "not convolved: no detector reaches the map"
         if any(step.grid_of(x).reached(x, widest) for x in context.observations):
-            fwhm, what = float(step.fwhm or o.focalplane.fwhm.max()), "Gaussian"
+            fwhm = float(step.fwhm or o.focalplane.fwhm.max())
+            what = "Gaussian"
             if step.beam != "gaussian":
-                fwhm, what = 0.0, "none"
+                fwhm = 0.0
+                what = "none"
         choices = (full(what), *self._without_beam(context, fwhm))
         effects: tuple[Effect, ...] = (
             Effect("beam convolution", choices, context.sky_error(1.0), "the sky's peak"),
@@ -156,7 +163,9 @@ class SkyPlanning(Planning[SkyMap]):
 
     def _order(self, context: Context, grid: Grid, fwhm: float) -> Effect:
         """Linear sampling for cubic splines, on the grid there is."""
-        operator, name, cubic = self.operator, "sampling order", "cubic B-spline"
+        operator = self.operator
+        name = "sampling order"
+        cubic = "cubic B-spline"
         if operator.interpolation == "linear" or not fwhm:
             what = "linear" if operator.interpolation == "linear" else cubic
             return exact(name, context.sky_error(CUBIC), "0.3 % of a point source's peak", what)
@@ -168,7 +177,8 @@ class SkyPlanning(Planning[SkyMap]):
             "1.1 h^2 / 12 (|f_xx| + |f_yy|) of a point source on n points h apart per FWHM: 1.02 /"
             " n^2 of its peak"
         )
-        bound, settings = context.sky_error(LINEAR / n**2), {"interpolation": "linear"}
+        bound = context.sky_error(LINEAR / n**2)
+        settings = {"interpolation": "linear"}
         linear = Choice("coarse", "linear", settings, False, bound, text, saves=STRAIGHT)
         return Effect(name, (full(cubic), linear), bound, text)
 
@@ -203,12 +213,14 @@ class SourcesPlanning(Planning[Any]):
     def memory(self, observation: Observation) -> int:
         """The catalogue, and lists of what is in view."""
         found = self._seen(observation)
-        lists, sources = 8 * len(found.number), 100 * len(found.power)
+        lists = 8 * len(found.number)
+        sources = 100 * len(found.power)
         return lists + 200 * observation.n_detectors + sources
 
     def estimate(self, context: Context) -> Estimate:
         """Error of leaving the step out: the brightest source."""
-        text, what = "the brightest source in its beam", "exact: each through its beam"
+        text = "the brightest source in its beam"
+        what = "exact: each through its beam"
         size = brightness(self.traits(context.first))
         return Estimate((exact("point sources", size, text, what), one_beam(context)))
 
@@ -240,7 +252,8 @@ class CMBPlanning(Planning[Any]):
 
     def estimate(self, context: Context) -> Estimate:
         """Error of leaving the step out."""
-        size, what = brightness(self.traits(context.first)), f"drawn at nside {self.operator.nside}"
+        size = brightness(self.traits(context.first))
+        what = f"drawn at nside {self.operator.nside}"
         return single("CMB", size, "4.5 (sum (2 l + 1) C_l / 4 pi)^(1/2), K_CMB", what)
 
 
@@ -263,7 +276,8 @@ class PySMPlanning(Planning[Any]):
 
     def estimate(self, context: Context) -> Estimate:
         """Error of leaving the step out."""
-        size, what = brightness(self.traits(context.first)), f"at nside {self.operator.nside}"
+        size = brightness(self.traits(context.first))
+        what = f"at nside {self.operator.nside}"
         return single("sky of PySM", size, "largest brightness in view", what)
 
     def _sampled(self, observation: Observation) -> SkyPlanning:

@@ -75,7 +75,8 @@ def read_map(source: Path | ArrayMap, **options: Any) -> InputMap:
     hdus: AbstractContextManager[Any]
     made: InputMap
     if isinstance(source, ArrayMap):
-        place, hdus = f"sky map {source.name}", nullcontext([source.hdu])
+        place = f"sky map {source.name}"
+        hdus = nullcontext([source.hdu])
     else:
         place = f"sky map {source}"
         hdus = opened(source, place, cure)
@@ -107,7 +108,9 @@ def _filled(header: MapHeader, found: InputMap, planes: Floats, factor: float, w
 
 
 def _image(hdu: Any, hdus: Any, header: ImageHeader) -> ImageMap:
-    place, wanted, notes = header.place, header.wanted, header.notes
+    place = header.place
+    wanted = header.wanted
+    notes = header.notes
     beside = _beside(hdu, hdus, header) if wanted.hdu is None else []
     images = [hdu, *beside]
     values = [_pixels(image, wanted) for image in images]
@@ -178,14 +181,16 @@ def _beside(first: Any, hdus: Any, header: MapHeader) -> list[Any]:
 
 def _healpix(table: HealpixTable, header: MapHeader) -> HealpixMap:
     """The map of a table in its column of I (`HealpixTable.intensity`)."""
-    wanted, notes = header.wanted, header.notes
+    wanted = header.wanted
+    notes = header.notes
     header.refuse(
         "{} does not apply to a HEALPix map",
         centre=wanted.centred,
         pixel_size=wanted.pixel_size,
         plane=wanted.plane,
     )
-    nest, names = table.nest, table.names
+    nest = table.nest
+    names = table.names
     frame, more = table.frame(wanted.coordsys)
     first = table.intensity(wanted.column)
     notes |= more | unused(f"column {names[first]}", names, first)
@@ -252,7 +257,8 @@ class ArrayMap(TextValue):
                 return cls(value.copy())
             if value.data is None or not getattr(value, "is_image", False):
                 raise mistake("the HDU holds neither an image nor a HEALPix table")
-            cards, value = _cards(value.header), value.data
+            cards = _cards(value.header)
+            value = value.data
         elif hasattr(value, "unit") and hasattr(value, "value"):
             value, unit = _in_known_unit(value)
             cards = {"BUNIT": unit} if unit else {}

@@ -85,10 +85,8 @@ def another_instruction_set() -> Measured:
     the same hits
     """
     with TemporaryDirectory() as folder:
-        here, there = (
-            _in_a_process(Path(folder, "here"), {}),
-            _in_a_process(Path(folder, "there"), baseline()),
-        )
+        here = _in_a_process(Path(folder, "here"), {})
+        there = _in_a_process(Path(folder, "there"), baseline())
     change = float(np.nanmax(np.abs(here["signal"] - there["signal"])))
     same = np.array_equal(here["hits"], there["hits"])
     return change / (SCALE * float(here["largest"])) if same else np.inf, f"{change:.1e} K"

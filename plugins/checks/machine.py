@@ -93,7 +93,8 @@ def denormals() -> Measured:
 )
 def rounding() -> int:
     """float64 sums, products and quotients that are rounded in another way"""
-    one, half = np.float64(1.0), np.float64(ULP / 2)
+    one = np.float64(1.0)
+    half = np.float64(ULP / 2)
     excess = (np.float64(1e16) + np.float64(2.9999)) - np.float64(1e16)
     good = [
         one + half == one,
@@ -121,12 +122,14 @@ def rounding() -> int:
 )
 def elementary_functions() -> Measured:
     """error of exp, log, sin and their like, of vectors as zonda calls them"""
-    worst, which = 0.0, ""
+    worst = 0.0
+    which = ""
     for name, x, exact in FUNCTIONS:
         found = getattr(np, name)(np.full(16, x))
         error = float(abs(found - exact).max() / np.spacing(abs(exact)))
         if not error <= worst:
-            worst, which = error, f"{name}({x:g})"
+            worst = error
+            which = f"{name}({x:g})"
     return worst, which
 
 

@@ -28,7 +28,8 @@ checks = Family("numerics")
 
 WHITE = 1.7e-3 * 10.0
 """K: rms of a sample at 100 Hz."""
-N_DET, N = 37, 5000
+N_DET = 37
+N = 5000
 
 SITES = (
     Site(name="Green Bank", latitude="38.4331 deg", longitude="-79.8398 deg", altitude="818 m"),
@@ -51,7 +52,8 @@ def ten_million() -> Floats:
     """A common mode of 10 K and, seven decades below, sources that cross the detectors one after
     the other.
     """
-    t, rng = np.arange(N), np.random.default_rng(8)
+    t = np.arange(N)
+    rng = np.random.default_rng(8)
     signal = 1e-6 * np.array(
         [np.exp(-0.5 * ((t - 1000 - 70 * d) / 20.0) ** 2) for d in range(N_DET)]
     )
@@ -82,11 +84,10 @@ def elevation_drift() -> Measured:
 @checks.add(PINK, reference="integral of the PSD", limit=4.5, unit="standard errors")
 def first_sample() -> Measured:
     """variance of the very first sample of 20000 detectors"""
-    law, n = power_law_filter(1e-3, 1.0, 8), 20_000
-    streams, out = (
-        Streams(law, stream_key(5, "a"), stream_key(5, "b")),
-        np.zeros((20_000, 1), np.float32),
-    )
+    law = power_law_filter(1e-3, 1.0, 8)
+    n = 20_000
+    streams = Streams(law, stream_key(5, "a"), stream_key(5, "b"))
+    out = np.zeros((20_000, 1), np.float32)
     streams.add(0, 0, out)
     ratio = float((out.astype(np.float64) ** 2).mean()) / law.variance
     return abs(ratio - 1) / math.sqrt(2 / n), f"{ratio:.4f} of theory"
@@ -97,7 +98,8 @@ def float32_states() -> float:
     """rms error of float32 states over the rms, f_min from 1e-8 to 1e-5 f_s, slopes 1 to 3"""
     from scipy.signal import lfilter
 
-    worst, n = 0.0, 1 << 14
+    worst = 0.0
+    n = 1 << 14
     for f_min, slope in ((1e-5, 1.0), (1e-8, 1.0), (1e-7, 2.0), (1e-5, 3.0)):
         law = power_law_filter(f_min, slope, 8)
         out = np.zeros((16, n), np.float32)
@@ -124,7 +126,8 @@ def over_a_day() -> float:
     """pointing error at 300 instants of a day in 1985, 2024 and 2027 (1.8e9 s), three sites, all
     over the sky
     """
-    rng, worst = np.random.default_rng(1), 0.0
+    rng = np.random.default_rng(1)
+    worst = 0.0
     for site in SITES:
         for year in (1985, 2024, 2027):
             start = Instant.parse(f"{year}-01-15T07:00:00.123456789Z")
@@ -144,7 +147,8 @@ def over_a_day() -> float:
 @checks.add(TIME, reference="the same instant reached from another start", limit=ERROR, unit="rad")
 def exact_start() -> Measured:
     """pointing error between start + dt and a start dt later, near 1.8e9 s"""
-    worst, sky = 0.0, unit_vectors(np.array([2.0]), np.array([0.3]))
+    worst = 0.0
+    sky = unit_vectors(np.array([2.0]), np.array([0.3]))
     for shift in (1, 999, 123_456_789, 499_999_999_999):
         early = Instant.parse("2027-01-15T03:04:05.678901234Z")
         late = Instant(early.nanoseconds + shift)

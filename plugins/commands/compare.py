@@ -274,7 +274,8 @@ def _compare(
         click.echo(f"warning: the maps are of different bands, {bands}: {what}", err=True)
     maps = read[1].planes
     references = on_meridians_of(maps["I"], read[0].planes)
-    both, written = [plane for plane in maps if plane in references], []
+    both = [plane for plane in maps if plane in references]
+    written = []
     matched: list[tuple[str, str]] = []
     with suppress(InputError):
         matched = template_rows(*map(read_map, paths)) if all(one.own for one in read) else []
@@ -351,7 +352,8 @@ def fluxes(
     from zonda.core.numerics.sphere import angle_text
     from zonda.operators.diagnostics.comparison.files import in_unit
 
-    rows, jansky = [], math.nan
+    rows = []
+    jansky = math.nan
     try:
         unit, size = parse_unit(plane.unit, place=plane.name)
         alone: Any = {"values": np.full((), size), "noise": None, "alone": None}

@@ -121,7 +121,8 @@ def show(
     from zonda.operators.atmosphere.weather.radiative_transfer import ELEVATION_MAX, ELEVATION_MIN
     from zonda.operators.atmosphere.weather.sources import profile_of
 
-    place, when = place_of(site), instant_of(time)
+    place = place_of(site)
+    when = instant_of(time)
     given = {key: value for key, value in source.items() if value is not None}
     cls, values = weather.resolve(given)
     model = checked("weather", lambda: cls.model_validate(values))
@@ -139,7 +140,8 @@ def show(
     )
     bands = list(dict.fromkeys(camera.band for camera in cameras))
     air = profile_of(model, place, when, seed)
-    parts, water = [place_lines(place, when, air), profile_lines(air)], None
+    parts = [place_lines(place, when, air), profile_lines(air)]
+    water = None
     if place.climatology is not None:
         water = pwv_by_month(place, when.datetime.year)
         parts.append(pwv_lines(water))
@@ -180,7 +182,8 @@ def fetch(site: str, time: str | None, hours: int, output: Path) -> None:
     from zonda.core.storage.files import atomic_path
     from zonda.operators.atmosphere.weather.era5 import retrieve
 
-    place, when = place_of(site), instant_of(time)
+    place = place_of(site)
+    when = instant_of(time)
     with atomic_path(output) as temporary:
         retrieve(place, when, hours, temporary)
     click.echo(f"{output}")

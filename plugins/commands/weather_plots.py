@@ -39,7 +39,8 @@ def when_figure(seen: Seen, year: Sequence[Month]) -> Figure:
 
 def plot_night(ax: Any, seen: Seen) -> None:
     """Elevation of the target, the Sun and the Moon from noon to noon; the night is shaded."""
-    night, offset = seen.night, solar_offset(seen.site)
+    night = seen.night
+    offset = solar_offset(seen.site)
     hours = (night.times - night.times[0]) / HOUR
     utc = (night.times[0] % 86400) / HOUR
     shade: Any = {"color": "0.5", "alpha": 0.16, "lw": 0, "transform": ax.get_xaxis_transform()}
@@ -52,7 +53,8 @@ def plot_night(ax: Any, seen: Seen) -> None:
     ):
         if not name.lower().startswith(own):
             ax.plot(hours, np.degrees(track.elevation), color=colour, lw=1.0, ls="--", label=name)
-    elevation, limit = np.degrees(night.target.elevation), math.degrees(night.above)
+    elevation = np.degrees(night.target.elevation)
+    limit = math.degrees(night.above)
     up = np.where(elevation >= limit, elevation, np.nan)
     ax.plot(hours, elevation, color=SEQUENCE[0], lw=1.0)
     ax.plot(hours, up, color=SEQUENCE[0], lw=2.8, label=seen.name)
@@ -91,7 +93,8 @@ def plot_year(ax: Any, seen: Seen, year: Sequence[Month]) -> None:
         hatches=["//"],
     )
     limit = math.degrees(seen.night.above)
-    low, high = elevation.min(), elevation.max()
+    low = elevation.min()
+    high = elevation.max()
     monthly = seen.name.lower() == "moon"  # too many lines for names
     steps = (15.0, 30.0, 45.0, 60.0, 75.0)
     levels = [level for level in steps if low < level < high and abs(level - limit) > 4]
@@ -185,7 +188,8 @@ def plot_pwv(ax: Any, water: PwvByMonth) -> None:
     from matplotlib import colormaps
 
     for k, hour in enumerate(HOURS):
-        colour, label = colormaps["viridis"](hour / 24), f"median, {hour:02d} h UTC"
+        colour = colormaps["viridis"](hour / 24)
+        label = f"median, {hour:02d} h UTC"
         ax.plot(month, water.median[:, k] * 1e3, color=colour, lw=1.2, label=label)
     ax.set_yscale("log")
     ax.set_xticks(month, [name[0] for name in MONTHS])
@@ -206,11 +210,13 @@ def plot_spectrum(
     """Emission (``brightness``) or ``transmission`` from 1 to 1000 GHz for several PWVs; bands are
     shaded, lines named above.
     """
-    low, high = LOWEST, HIGHEST
+    low = LOWEST
+    high = HIGHEST
     for k, pwv in enumerate(pwv_steps(air)):
         seen = spectrum(air.scaled(pwv).layers, elevation, low=low, high=high)
         values = seen.brightness if which == "brightness" else np.exp(-seen.slant_opacity)
-        own, label = pwv == air.pwv, f"PWV {pwv * 1e3:.3g} mm"
+        own = pwv == air.pwv
+        label = f"PWV {pwv * 1e3:.3g} mm"
         style = {"color": "black", "lw": 1.4} if own else {"color": SEQUENCE[k % 6], "lw": 0.9}
         ax.plot(seen.frequency / 1e9, values, label=label, **style)
     place = ax.get_xaxis_transform()  # in the height of the picture, whatever its scale
@@ -270,10 +276,12 @@ def spread(places: Sequence[float], least: float, low: float, high: float) -> li
         tuple[float, int]
     ] = []  # places less what goes before, of names that touch: their mean and number
     for k, place in enumerate(places):
-        mean, count = place - k * least, 1
+        mean = place - k * least
+        count = 1
         while groups and groups[-1][0] >= mean:
             before, number = groups.pop()
-            mean, count = (mean * count + before * number) / (count + number), count + number
+            mean = (mean * count + before * number) / (count + number)
+            count = count + number
         groups.append((mean, count))
     means = [mean for mean, count in groups for _ in range(count)]
     last = high - (len(places) - 1) * least

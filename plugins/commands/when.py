@@ -90,7 +90,9 @@ def when(
     if site is None:
         raise click.MissingParameter(param_hint="'--site'", param_type="option")
     name = " ".join(target)
-    subject, place, moment = target_of(name), place_of(site), instant_of(time)
+    subject = target_of(name)
+    place = place_of(site)
+    moment = instant_of(time)
     limit = checked("--above", lambda: Unit("rad", "30 deg").parse(above))
     if not 0 <= limit < math.pi / 2:
         raise click.BadParameter(

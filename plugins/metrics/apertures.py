@@ -59,7 +59,8 @@ class _InAperture(FigureMetric):
         """
         product = map_of(data, self.own_name(), signal, self.map)
         product = product if product.polarization is None else product.stokes("I")
-        maps, name = maps_of(data.products), product_name(stream_of(signal), self.map)
+        maps = maps_of(data.products)
+        name = product_name(stream_of(signal), self.map)
         quiet = is_quiet(data.provenance.get("runs", {}), name)
         if quiet:
             product = product.with_planes(noise=np.zeros(product.hits.shape))

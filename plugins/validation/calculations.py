@@ -99,7 +99,9 @@ class Calculation(TextValue):
     json_schema = {"type": "object", "minProperties": 1, "maxProperties": 1}  # noqa: RUF012
 
     def __init__(self, name: str, arguments: Mapping[str, Any], value: float) -> None:
-        self.name, self.arguments, self.value = name, dict(arguments), value
+        self.name = name
+        self.arguments = dict(arguments)
+        self.value = value
 
     @classmethod
     def parse(cls, value: Any) -> Calculation:

@@ -213,7 +213,8 @@ class Experiment(Parameters):
         if self.versus is not None:
             other = ", ".join(f"{key}={value}" for key, value in self.versus.items())
             parts.append(f"{self.statistic} to {other}")
-        metric, seeds = self.metric, self.seeds or 1
+        metric = self.metric
+        seeds = self.seeds or 1
         if not isinstance(metric, str):
             metric = ", ".join(f"{name}({given or ''})" for name, given in metric.items())
         return ", ".join([*parts, metric, f"{seeds} seed{'s' if seeds > 1 else ''}"])

@@ -35,7 +35,8 @@ def draw(row: Row) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    claim, paper = row.claim, row.claim.paper
+    claim = row.claim
+    paper = row.claim.paper
     beside = [_line(c) for c in row.counters if c.comparable]
     own = ([("zonda", row.values, OWN), *beside], paper.factor, paper.unit or claim.statistic)
     panels = [own]
@@ -45,7 +46,8 @@ def draw(row: Row) -> Figure:
     heights = [(0.6 if k else 1.3) + LINE * len(lines) for k, (lines, _, _) in enumerate(panels)]
     figure = Figure(figsize=(6.4, sum(heights)), dpi=110, layout="constrained")
     axes = figure.subplots(len(heights), squeeze=False, height_ratios=heights)[:, 0]
-    value, half = paper.value / paper.factor, (claim.rounding.value + claim.error.value)
+    value = paper.value / paper.factor
+    half = claim.rounding.value + claim.error.value
     sign = {"equal": "", "at_least": "at least ", "at_most": "at most "}[claim.relation]
     if half:
         span = value - half / paper.factor, value + half / paper.factor
@@ -69,7 +71,8 @@ def _draw_lines(
         numbers = [v / factor for v in values.values]
         if len(numbers) > 1:
             ax.plot(numbers, [-k - 0.18] * len(numbers), "|", color=colour, ms=8, alpha=0.6)
-        error, mean = values.standard_error / factor or None, values.mean / factor
+        error = values.standard_error / factor or None
+        mean = values.mean / factor
         ax.errorbar(mean, -k, xerr=error, fmt="o", color=colour, ms=6, capsize=3)
     ax.set_yticks([-k for k in range(len(lines))], [name for name, _, _ in lines])
     ax.set_ylim(-len(lines) + 0.4, 0.6)
@@ -81,7 +84,8 @@ def _draw_lines(
 
 def _axis(counter: CounterResult) -> str:
     """Name of its values, with their unit."""
-    unit, what = counter.unit.unit, counter.experiment.statistic or "value"
+    unit = counter.unit.unit
+    what = counter.experiment.statistic or "value"
     return f"{what} [{unit}]" if unit else what
 
 
@@ -191,7 +195,9 @@ def summary(rows: Sequence[Row]) -> str:
 
 def _record(row: Row) -> dict[str, Any]:
     """Values of `COLUMNS`; numbers in the unit of the paper's value."""
-    claim, values, comparison = row.claim, row.values, row.comparison
+    claim = row.claim
+    values = row.values
+    comparison = row.comparison
     factor = claim.paper.factor
     return {
         "id": claim.id,

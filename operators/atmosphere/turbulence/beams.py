@@ -71,7 +71,8 @@ class Aperture:
     def moments(self) -> tuple[float, float]:
         """(m, m2) of equation (3), m2 and m4."""
         u, w = _illumination(self.taper)
-        two, four = float(w @ u**2), float(w @ u**4)
+        two = float(w @ u**2)
+        four = float(w @ u**4)
         a = self.diameter / 2
         return two / 2 * a**2, (four / 16 + two**2 / 8) * a**4
 
@@ -132,7 +133,8 @@ class Aperture:
                 np.arange(30.0, 201.0, 2.0),
             ]
         )
-        middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+        middle = (edges[1:] + edges[:-1]) / 2
+        half = np.diff(edges) / 2
         k = (middle[:, None] + half[:, None] * x).ravel() / a
         dk = (half[:, None] * weight).ravel() / a
         power = (

@@ -46,12 +46,15 @@ def structure(x: ArrayLike) -> Floats:
     near = x < 2
     y = x[near]
     q = (y / 2) ** 2
-    plus, minus = np.ones_like(y), np.zeros_like(y)
-    up, down = np.ones_like(y), np.ones_like(y)
+    plus = np.ones_like(y)
+    minus = np.zeros_like(y)
+    up = np.ones_like(y)
+    down = np.ones_like(y)
     for k in range(1, _TERMS):
         up = up * q / (k * (k + NU))
         down = down * q / (k * (k - NU))
-        plus, minus = plus + up, minus + down
+        plus = plus + up
+        minus = minus + down
     out[near] = math.gamma(1 - NU) / math.gamma(1 + NU) * (y / 2) ** (2 * NU) * plus - minus
     out[~near] = 1 - _tail(x[~near])
     return out
@@ -135,7 +138,8 @@ def mixture_between(
     if bottom <= 0:
         bottom = 1e-13 * min(sigma, outer_scale) ** 2
         nodes *= 2
-    a, b = math.log(bottom), math.log(high - sigma**2)
+    a = math.log(bottom)
+    b = math.log(high - sigma**2)
     x, weight = _gauss_legendre(nodes)
     s = np.exp((a + b) / 2 + (b - a) / 2 * x)
     return s + sigma**2, _density(s, outer_scale) * weight * (b - a) / 2

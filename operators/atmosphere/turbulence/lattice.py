@@ -85,12 +85,10 @@ class Turbulence:
         fidelity: str = "default",
     ) -> None:
         sigma = aperture.sigma if aperture else sigma
-        self.outer_scale, self.sigma, self.aperture, self.fidelity = (
-            outer_scale,
-            sigma,
-            aperture,
-            FIDELITIES[fidelity],
-        )
+        self.outer_scale = outer_scale
+        self.sigma = sigma
+        self.aperture = aperture
+        self.fidelity = FIDELITIES[fidelity]
         if not (np.isfinite([outer_scale, sigma]).all() and outer_scale > 0 and sigma > 0):
             raise InputError(
                 f"outer scale {outer_scale:g} m and beam {sigma:g} m must be finite and positive",

@@ -93,7 +93,8 @@ def gaussian_levels(
     """The finest first, behind a Gaussian beam."""
     f = FIDELITIES[fidelity]
     exponent = math.floor(math.log2(lattice * sigma))
-    low, top = sigma**2, LARGEST_SCALE * outer_scale**2 + sigma**2
+    low = sigma**2
+    top = LARGEST_SCALE * outer_scale**2 + sigma**2
     levels = []
     while low < top:
         high = min((2 * math.ldexp(1.0, exponent) / f.resolution) ** 2, top)
@@ -118,13 +119,15 @@ def aperture_levels(
     """
     f = FIDELITIES[fidelity]
     exponent = math.floor(math.log2(aperture.sigma * min(lattice, 0.5)))
-    low, top = aperture.sigma**2, LARGEST_SCALE * outer_scale**2
+    low = aperture.sigma**2
+    top = LARGEST_SCALE * outer_scale**2
     levels = [
         Level(exponent, _aperture_kernel(outer_scale, aperture, low, math.ldexp(1.0, exponent), f))
     ]
     while low < top:
         exponent += 1
-        spacing, kernel = math.ldexp(1.0, exponent), None
+        spacing = math.ldexp(1.0, exponent)
+        kernel = None
         high = min((2 * spacing / f.resolution) ** 2 - aperture.sigma**2, top)
         if high > low:
             s, w = mixture_between(outer_scale, 0.0, low, high)
@@ -188,7 +191,8 @@ def _separable_kernel(e: Floats, w: Floats, spacing: float, radius: int) -> Fiel
     k = 2 * np.pi * np.fft.rfftfreq(_GRID, spacing)  # the spectrum is even
     alias = 2 * np.pi / spacing * np.arange(-2, 3)
     square = np.add.outer(alias, k) ** 2
-    own, others = square[2].max(), square.min(1)
+    own = square[2].max()
+    others = square.min(1)
     heard = (
         others <= own + _NEGLIGIBLE / e.min()
     )  # of the images, those that are not lost beside the wave itself
@@ -236,7 +240,8 @@ def kriging(taps: int, resolution: float) -> Field:
     octaves = np.arange(4)
 
     def model(r: Floats) -> Floats:
-        scale, weight = 2 ** (-octaves / 2), 2 ** (NU * octaves)
+        scale = 2 ** (-octaves / 2)
+        weight = 2 ** (NU * octaves)
         return np.asarray(
             (np.exp(-((np.multiply.outer(r, scale) * resolution / 2) ** 2)) * weight).sum(-1),
             np.float64,

@@ -76,7 +76,9 @@ class LinesOfSight:
         first: int,
         count: int,
     ) -> None:
-        self.step, self.first, self.count = step, first, count
+        self.step = step
+        self.first = first
+        self.count = count
         index = step * (first + np.arange(count, dtype=np.int64))
         self.seconds = observation.seconds_at(index)
         axes = axes_at(observation.boresight_azel, index, step)  # (n, 3 components, 3 axes)
@@ -131,10 +133,12 @@ class LinesOfSight:
 
     def _sines(self, up: Floats, xi: Floats, eta: Floats) -> tuple[float, float]:
         norm = 1 / np.sqrt(1 + xi * xi + eta * eta)
-        low, high = 1.0, 0.0
+        low = 1.0
+        high = 0.0
         for a, b, n in zip(xi, eta, norm, strict=True):
             sine = (up[:, 0] + a * up[:, 1] + b * up[:, 2]) * n
-            low, high = min(low, float(sine.min())), max(high, float(sine.max()))
+            low = min(low, float(sine.min()))
+            high = max(high, float(sine.max()))
         check_above_horizon(low)
         radius = math.atan(float(np.hypot(xi, eta).max()))
         if (
@@ -198,7 +202,8 @@ def _about_the_boresight(linear: Floats, cone: Cone) -> tuple[Floats, Floats]:
         one * ahead[:, 0] + two * ahead[:, 1],
     )
     turn = azimuth / math.sin(cone.elevation)
-    c, s = np.cos(turn), np.sin(turn)
+    c = np.cos(turn)
+    s = np.sin(turn)
     return rows, np.stack([one * c - two * s, one * s + two * c])
 
 

@@ -84,7 +84,9 @@ class DriftingLayers:
         dtype: type = np.float64,
     ) -> None:
         first, stop = span
-        self._drifting, self._step, self._band = list(drifting), step, 0
+        self._drifting = list(drifting)
+        self._step = step
+        self._band = 0
         self.weights = np.zeros((0, len(self._drifting)))
         """(k, n_layer) weights of further sums over the layers, which `sums` makes beside the plain
         one.
@@ -138,8 +140,10 @@ class DriftingLayers:
 
         The plain sums have the same bits with such weights and without.
         """
-        bands, stop = [self, *others], first + count
-        total, sine = np.zeros((len(bands), len(xi), count)), np.empty((len(xi), count))
+        bands = [self, *others]
+        stop = first + count
+        total = np.zeros((len(bands), len(xi), count))
+        sine = np.empty((len(xi), count))
         weighted = [np.zeros((len(band.weights), len(xi), count)) for band in bands]
         for own in sorted(set().union(*(band.paths for band in bands))):
             if own == self._step:
@@ -163,7 +167,8 @@ class DriftingLayers:
         these ``bands`` of its tiles see it.
         """
         matrix, i, j = self._places[n]
-        i, j = i[at], j[at]
+        i = i[at]
+        j = j[at]
         cover = self._tilings[n].cover(bands, matrix, boxes, i, j)
         where = *cover.sides, *cover.origin, cover.width, cover.addresses
         interpolate(matrix, x, y, i, j, *where, self._constants[n], which, out)
@@ -181,10 +186,8 @@ class DriftingLayers:
         ):
             return False
         for n, (layer, theirs) in enumerate(zip(self._drifting, other._drifting, strict=True)):
-            own, others = (
-                (*self._places[n], self._constants[n]),
-                (*other._places[n], other._constants[n]),
-            )
+            own = (*self._places[n], self._constants[n])
+            others = (*other._places[n], other._constants[n])
             if layer.step == theirs.step and not all(map(np.array_equal, own, others)):
                 return False
         return self._constants[0].dtype == other._constants[0].dtype
@@ -232,12 +235,14 @@ def _sums_at(
     `DriftingLayers.sums` returns, at times of that step from ``first`` on.
     """
     path = next(band.paths[step] for band in bands if step in band.paths)
-    groups, count = _groups(bands, step), sine.shape[1]
+    groups = _groups(bands, step)
+    count = sine.shape[1]
     for start in range(0, count, TIMES_AT_ONCE):
         now = slice(start, min(start + TIMES_AT_ONCE, count))
         x, y, sine[:, now] = path(xi, eta, first + start, now.stop - start)
         at = slice(first + start - path.first, first + now.stop - path.first)
-        part, boxes = np.zeros((len(bands), *x.shape)), boxes_of(x, y)
+        part = np.zeros((len(bands), *x.shape))
+        boxes = boxes_of(x, y)
         parts = [np.zeros((len(band.weights), *x.shape)) for band in bands]
         for n, which in groups:
             alone = np.zeros_like(part) if any(len(parts[k]) for k in which) else part
@@ -299,15 +304,15 @@ def share_tiles(bands: Sequence[DriftingLayers]) -> list[Counter[int]]:
     For each band, the number of layers of each other band that are on the lattices it looks
     through.
     """
-    tiles, number, found = Tiles(), 0, [Counter[int]() for _ in bands]
+    tiles = Tiles()
+    number = 0
+    found = [Counter[int]() for _ in bands]
     for layer in range(len(bands[0]._drifting)):
         left = list(range(len(bands)))
         while left:
-            field, swept, here = (
-                bands[left[0]]._drifting[layer].field,
-                bands[left[0]]._swept[layer],
-                [],
-            )
+            field = bands[left[0]]._drifting[layer].field
+            swept = bands[left[0]]._swept[layer]
+            here = []
             for other in left:
                 one = bands[other]
                 if one._drifting[layer].field.alike(field) and (
@@ -324,7 +329,8 @@ def share_tiles(bands: Sequence[DriftingLayers]) -> list[Counter[int]]:
             for k in here:
                 bands[k]._band, bands[k]._tilings[layer] = k, tiling
                 found[k].update(other for other in here if other != k)
-            left, number = [k for k in left if k not in here], number + 1
+            left = [k for k in left if k not in here]
+            number = number + 1
     return found
 
 

@@ -113,12 +113,14 @@ class Tiles:
 
         ``fields``: of all bands that look through this lattice, by number.
         """
-        key, place = (lattice, bands, box), (lattice, box)
+        key = (lattice, bands, box)
+        place = (lattice, box)
         if (kept := self._kept.get(key)) is not None:
             return kept
         while True:
             with self._lock:
-                kept, making = self._kept.get(key), self._making.get(place)
+                kept = self._kept.get(key)
+                making = self._making.get(place)
                 if kept is not None:
                     return kept
                 if making is None:
@@ -210,10 +212,15 @@ class Tiling:
         fields: Mapping[int, Turbulence],
         swept: Swept,
     ) -> None:
-        self._tiles, self._number, self.fields = tiles, number, fields
+        self._tiles = tiles
+        self._number = number
+        self.fields = fields
         low, high, begin, end = swept.box
         spare = SPARE + (high - low) // BEYOND
-        low, high, begin, end = low - spare, high + 1 + spare, begin - spare, end + 1 + spare
+        low = low - spare
+        high = high + 1 + spare
+        begin = begin - spare
+        end = end + 1 + spare
         held = points_of(swept.box)
         self._piece = (low, high, begin, end) if held <= ONE_PIECE else None
         self._slab: tuple[int, int, int] | None = None
@@ -231,7 +238,9 @@ class Tiling:
         x, y as of `boxes_of`.
         """
         low_i, high_i, low_j, high_j = extent(matrix, boxes, i, j)
-        piece, slab, sides = self._piece, self._slab, self._sides
+        piece = self._piece
+        slab = self._slab
+        sides = self._sides
         if (
             piece
             and piece[0] <= low_i <= high_i < piece[1]
@@ -247,19 +256,24 @@ class Tiling:
             )
         if slab and slab[0] <= low_i <= high_i < slab[1]:
             sides = _WHOLE, slab[2]
-        first_i, first_j = low_i >> sides[0], low_j >> sides[1]
+        first_i = low_i >> sides[0]
+        first_j = low_j >> sides[1]
         wanted = np.zeros(
             ((high_i >> sides[0]) - first_i + 1, (high_j >> sides[1]) - first_j + 1),
             np.uint8,
         )
         mark(matrix, boxes, i, j, *sides, first_i, first_j, wanted)
-        begin, across = first_i << sides[0], 1 << sides[0]
+        begin = first_i << sides[0]
+        across = 1 << sides[0]
         if slab and sides[0] == _WHOLE:
             wanted = wanted.max(axis=0, keepdims=True)
-            begin, across = slab[0], slab[1] - slab[0]
-        addresses, held = np.zeros(wanted.shape, np.uint64), []
+            begin = slab[0]
+            across = slab[1] - slab[0]
+        addresses = np.zeros(wanted.shape, np.uint64)
+        held = []
         for a, b in zip(*(index.tolist() for index in np.nonzero(wanted)), strict=True):
-            k, m = begin + a * across, (first_j + b) << sides[1]
+            k = begin + a * across
+            m = (first_j + b) << sides[1]
             tile, addresses[a, b] = self._get(bands, (k, k + across, m, m + (1 << sides[1])))
             held.append(tile)
         return Cover(sides, (begin, first_j << sides[1]), held[0].shape[1], addresses, held)

@@ -70,7 +70,9 @@ class Quantity(NamedTuple):
     unit: str
 
 
-SHARE, SPEED, ENERGY = ("kg kg-1", ""), ("m s-1", "m s-1"), "m2 s-2"
+SHARE = ("kg kg-1", "")
+SPEED = ("m s-1", "m s-1")
+ENERGY = "m2 s-2"
 QUANTITIES = {
     "t": Quantity("temperature", ("ta",), "air_temperature", "K", "K"),
     "q": Quantity("specific_humidity", ("hus",), "specific_humidity", *SHARE),
@@ -145,7 +147,8 @@ class NetCdf:
     """
 
     def __init__(self, variables: dict[str, Variable], place: str) -> None:
-        self._variables, self._place = variables, place
+        self._variables = variables
+        self._place = place
         self.below_none = 0
         self.remarks: dict[str, None] = {}
         found = {
@@ -201,10 +204,8 @@ class NetCdf:
     def values(self, name: str, where: Any = ()) -> Floats:
         """Unpacked values, NaN where they are missing."""
         raw = self.raw(name, where)
-        scale, offset = (
-            self.attribute(name, "scale_factor", 1.0),
-            self.attribute(name, "add_offset", 0),
-        )
+        scale = self.attribute(name, "scale_factor", 1.0)
+        offset = self.attribute(name, "add_offset", 0)
         out = raw.astype(np.float64) * float(scale) + float(offset)
         for key in ("_FillValue", "missing_value"):
             if (value := self.attribute(name, key)) is not None:
@@ -219,7 +220,8 @@ class NetCdf:
         log: bool,
     ) -> Floats:
         """(n_level,) of a quantity, SI."""
-        name, quantity = self._names[key], QUANTITIES[key]
+        name = self._names[key]
+        quantity = QUANTITIES[key]
         factor, offset = self._scale(name, quantity.default, quantity.unit)
         total: Floats | float = 0.0
         for i, a in weights["time"].items():
@@ -294,7 +296,8 @@ class NetCdf:
         if axis.name != "time" or "step" not in self._variables:
             return axis
         steps = self.values("step") * self._scale("step", "", "s")[0]
-        values, more = axis.values[:, None] + steps, self._variables["step"].dims
+        values = axis.values[:, None] + steps
+        more = self._variables["step"].dims
         on = zip(values.shape, (axis.dims, more), strict=True)
         shape = tuple(n for n, dims in on if dims)
         return Axis(axis.name, (*axis.dims, *more), shape, values.ravel())
@@ -307,7 +310,8 @@ class NetCdf:
         return np.atleast_1d(posix_times(raw, self.text(name, "units"), calendar, name))
 
     def _column(self, name: str, axes: dict[str, Axis], at: dict[str, int]) -> Floats:
-        names, level = self._variables[name].dims, axes["level"].dims
+        names = self._variables[name].dims
+        level = axes["level"].dims
         index: dict[str, Any] = at | {level[0]: slice(None)} if level else dict(at)
         if any(dim not in names for dim in index) or not level:
             message = f"the variable {name} lies on {', '.join(names) or 'no axis'}"
@@ -344,7 +348,8 @@ def posix_times(values: Any, units: str, calendar: str | None, name: str) -> Flo
         A unit, a reference or a calendar that is not known, also in part; numbers that are rounded
         to more than a minute.
     """
-    raw, text = np.asarray(values), " ".join(units.split()).lower()
+    raw = np.asarray(values)
+    text = " ".join(units.split()).lower()
     calendar = (calendar or "standard").strip().lower()
     if calendar not in CALENDARS:
         raise InputError(
@@ -356,7 +361,8 @@ def posix_times(values: Any, units: str, calendar: str | None, name: str) -> Flo
         )
     try:
         if AS_DATE.fullmatch(text):
-            unit, start = 86400.0, 0.0
+            unit = 86400.0
+            start = 0.0
         else:
             unit_of, since, reference = text.partition(" since ")
             unit = float(read_unit(str(SPELLED.get(unit_of, unit_of))).to(u.s)) if since else 0.0
@@ -394,7 +400,8 @@ def _reference(text: str, calendar: str) -> float:
     found = found if found.tzinfo else found.replace(tzinfo=UTC)
     if abs(found.utcoffset() or timedelta()) > timedelta(hours=14):
         raise ValueError("no such time zone")
-    later, day = 0, (found.year, found.month, found.day)
+    later = 0
+    day = (found.year, found.month, found.day)
     if calendar != "proleptic_gregorian" and day < (1582, 10, 15):
         if day > (1582, 10, 4):
             raise ValueError("the standard calendar has no such date")
@@ -414,7 +421,8 @@ def opened(path: Path, place: str) -> Iterator[NetCdf]:
     """A NetCDF-3 or NetCDF-4 file. Raises `InputError` for what is none."""
     import h5py
 
-    kind, cure = "NetCDF", f"a GRIB file must be converted, a zip file unpacked; {GET}"
+    kind = "NetCDF"
+    cure = f"a GRIB file must be converted, a zip file unpacked; {GET}"
     with reading(place, kind, cure):
         of_hdf5 = path.is_file() and h5py.is_hdf5(path)
     if of_hdf5:

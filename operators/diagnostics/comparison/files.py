@@ -86,7 +86,8 @@ def on_meridians_of(other: Plane, planes: Mapping[str, Plane]) -> dict[str, Plan
     """
     if "Q" not in planes:
         return dict(planes)
-    q, u = planes["Q"], planes["U"]
+    q = planes["Q"]
+    u = planes["U"]
     pole = q.grid.turn @ other.grid.turn[2]
     if 1 - float(pole @ NORTH) < SAME:
         return dict(planes)
@@ -231,26 +232,27 @@ def _on_one_grid(a: Plane, b: Plane) -> bool:
         return False
     if a.pixels is None or b.pixels is None:
         return a.pixels is b.pixels and dict(a.header) == dict(b.header)
-    one, two = a.pixels, b.pixels
+    one = a.pixels
+    two = b.pixels
     alike = (one.nside, one.nest, one.frame) == (two.nside, two.nest, two.frame)
     return alike and np.array_equal(one.pixels, two.pixels)
 
 
 def _read(path: Path, name: str, wanted: Wanted) -> ReadMap:
-    place, name = str(path), name or path.name
+    place = str(path)
+    name = name or path.name
     with opened(path, place, "check the file, e.g. with fitsverify, or copy it again") as hdus:
         hdu, _ = chosen(hdus, wanted.hdu, place)
         check_size(hdu, place)
         healpix = is_healpix(hdu)
         if not wanted.shared:
             if healpix and wanted.plane is not None:
-                what, cure = "plane is for images, and this is a HEALPix table", "remove it"
+                what = "plane is for images, and this is a HEALPix table"
+                cure = "remove it"
                 raise InputError(what, place=place, cure=cure)
             if not healpix and wanted.coordsys is not None:
-                what, cure = (
-                    "coordsys is for HEALPix maps",
-                    "remove it: CTYPE says what an image's are",
-                )
+                what = "coordsys is for HEALPix maps"
+                cure = "remove it: CTYPE says what an image's are"
                 raise InputError(what, place=place, cure=cure)
             if not healpix and wanted.column is not None:
                 what = "column is for HEALPix maps"
@@ -274,7 +276,8 @@ class Found:
     def read(self, name: str, about: FileHeader) -> ReadMap:
         """The planes with what the header ``about`` says of them."""
         image = not isinstance(self.where, HealpixPixels)
-        unit, factor = "", 1.0
+        unit = ""
+        factor = 1.0
         if written := str(self.unit or "").strip():
             scale = about.text("TEMPSCAL") or None
             try:
@@ -288,7 +291,8 @@ class Found:
         fwhm = math.radians(math.sqrt(major * minor)) if min(major, minor) > 0 else None
         hertz = about.number("RESTFRQ") or about.number("RESTFREQ") or 0.0
         convention = (about.text("POLCCONV") or ("" if image else "COSMO")).upper()
-        letters, notes = [key for key in IQU if key in self.values], list(self.notes)
+        letters = [key for key in IQU if key in self.values]
+        notes = list(self.notes)
         if "Q" in letters and convention not in ("COSMO", "IAU"):
             unknown = f"{name} has them and no POLCCONV; set that header key to COSMO or IAU"
             notes.append(f"Q and U: not compared: {unknown}")
@@ -296,12 +300,15 @@ class Found:
         planes = {}
         for key in letters:
             sign = -1.0 if key == "U" and convention == "IAU" else 1.0
-            noise, alone = self.values.get(f"noise {key}"), self.values.get(f"half {key}")
+            noise = self.values.get(f"noise {key}")
+            alone = self.values.get(f"half {key}")
             own, words = self.stated.get(key, (None, ""))
             if quiet := words == ELSEWHERE:
-                own, words = None, ""
+                own = None
+                words = ""
             if alone is not None:
-                own, words = None, f"half the difference, {self.halves}"
+                own = None
+                words = f"half the difference, {self.halves}"
             elif own is not None and noise is not None:
                 noise = noise * own
             planes[key] = Plane(
@@ -317,7 +324,8 @@ class Found:
                 quiet=quiet,
             ).scaled(factor, unit)
         if fwhm and image:
-            shape, sides = planes["I"].values.shape, planes["I"].grid.sides
+            shape = planes["I"].values.shape
+            sides = planes["I"].grid.sides
             cure = "BMAJ and BMIN are degrees (of 18 arcsec 0.005); correct them"
             check_width(
                 fwhm,
@@ -346,7 +354,8 @@ def _images(hdus: Any, hdu: Any, wanted: Wanted, place: str) -> Found:
     planes = {"I": index, **dict(zip("QU", polarized, strict=False))}
     found = {key: np.asarray(hdu.data[at], np.float64) for key, at in planes.items()}
     stated: dict[str, tuple[float, str]] = {}
-    halves, alike = "of two halves", []
+    halves = "of two halves"
+    alike = []
     if wanted.hdu is None and STOKES not in told and not polarized:  # extensions beside are of it
         alike = [other for other in hdus if other.is_image and other.shape == shape]
     letters = q_and_u([str(other.name) for other in alike])
@@ -385,7 +394,8 @@ def _stated(header: FileHeader, of: str) -> dict[str, tuple[float, str]]:
 
 def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
     """Pixels of a HEALPix table with a value, with their noise and what holds noise alone."""
-    table, header = HealpixTable(hdu, place), hdu.header
+    table = HealpixTable(hdu, place)
+    header = hdu.header
     given = (table.text("COORDSYS") or wanted.coordsys) if wanted.shared else wanted.coordsys
     frame, _ = table.frame(given or None)
     names = [name.upper() for name in table.names]
@@ -411,7 +421,8 @@ def _healpix(hdu: Any, wanted: Wanted, place: str) -> Found:
         key: (_root(v) if names[columns[key]].startswith("COV") else v)[seen]
         for key, v in planes.items()
     }
-    unit, halves = header.get(f"TUNIT{1 + columns['I']}"), table.text("JACKKNIF")
+    unit = header.get(f"TUNIT{1 + columns['I']}")
+    halves = table.text("JACKKNIF")
     return Found(where, values_of, unit, stated, halves=halves or "of two halves")
 
 
@@ -541,7 +552,8 @@ def write_comparison(found: Comparison, stem: Path, meta: Mapping[str, Any]) -> 
     about |= {key.upper(): value for key, value in found.values.items() if math.isfinite(value)}
     unit = fits_unit(found.unit)
     write_ecsv(paths[1], found.spectra.columns(unit, coherence=True), about)
-    p, error = found.profiles, "standard error from the scatter, one value per beam"
+    p = found.profiles
+    error = "standard error from the scatter, one value per beam"
     columns = [Column("radius", p.radius / ARCSEC, "arcsec", "middle of the ring")]
     for name, mean in p.mean.items():
         columns.append(Column(name, mean, unit, "mean in the ring"))
