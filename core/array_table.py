@@ -78,7 +78,8 @@ LEAKAGE = "pol_leakage"
 """TOAST's cross-polar leakage e, in place of the efficiency (1 - e) / (1 + e)."""
 KNOWN = (*TEXTS, *QUANTITIES, LEAKAGE)
 """Columns that are read."""
-ANGLE, PLACE = ("polarization_angle",), ("xi", "eta")
+ANGLE = ("polarization_angle",)
+PLACE = ("xi", "eta")
 NOT_READ: dict[str, tuple[tuple[str, ...], str]] = {
     "psd_net": (
         ("net",),
@@ -161,7 +162,8 @@ class ArrayTable:
 
         A camera of one band may be one of several that the table has.
         """
-        table, has = self.table, f"the instrument has: {', '.join(counts)}"
+        table = self.table
+        has = f"the instrument has: {', '.join(counts)}"
         if several and not self.bands:
             cure = f"add it, with the name of a band in each row: {', '.join(counts)}"
             table.note(None, "has no column 'band', and the instrument has several", cure)
@@ -250,7 +252,8 @@ def _read(path: Path, changed: int, size: int) -> ArrayTable:
 
 def _rename(table: Table) -> list[str]:
     """Give columns that others call otherwise (`ALIASES`) our names; notes of them."""
-    columns, notes = dict[str, tuple[Sequence[str], str]](), list[str]()
+    columns = dict[str, tuple[Sequence[str], str]]()
+    notes = list[str]()
     there = {ALIASES.get(written.lower(), written.lower()) for written in table.columns}
     for written, column in table.columns.items():
         plain = written.lower()
@@ -277,9 +280,11 @@ def _check_angles(table: Table) -> None:
     """Angles of polarization that are in another unit than written: turns and turns of rad, or
     degrees that are parts of pi.
     """
-    values, unit = table.values("polarization_angle"), table.columns["polarization_angle"][1]
+    values = table.values("polarization_angle")
+    unit = table.columns["polarization_angle"][1]
     size = np.abs(values[np.isfinite(values) & (values != 0)])
-    largest, parts = size.max(initial=0), size / (np.pi / 24)
+    largest = size.max(initial=0)
+    parts = size / (np.pi / 24)
     text = ""
     if unit in ("rad", "radian") and largest > 4 * np.pi:
         text = f"polarization_angle goes to {largest:g} rad, more than two turns"
@@ -310,7 +315,8 @@ def _check_columns(table: Table) -> None:
 
 def _check_limits(table: Table, key: str) -> None:
     """Check the limits of a column: those of a pure number, and zero, hold in every unit."""
-    values, most = table.values(key), LARGEST.get(key, np.inf)
+    values = table.values(key)
+    most = LARGEST.get(key, np.inf)
     low = -np.inf if key in SIGNED else 0.0
     limits = "more than 0" if key in POSITIVE else "0 or more"
     limits += f", at most {most:g}" if key in LARGEST else ""
@@ -350,6 +356,7 @@ def stated_by(table: ArrayTable, band: str, stated: Mapping[str, Any]) -> dict[s
     found: dict[str, Any] = {"detectors": len(rows)}
     for key in OF_INSTRUMENT:
         if key in table.columns:
-            value, unit = float(np.median(table.columns[key][rows])), QUANTITIES[key]
+            value = float(np.median(table.columns[key][rows]))
+            unit = QUANTITIES[key]
             found[key] = f"{value!r} {unit}" if unit else value
     return {key: value for key, value in found.items() if stated.get(key) is None}

@@ -159,8 +159,10 @@ def _read_passband(path: Path) -> tuple[Floats, Floats]:
     t = table.numbers("transmission")
     table.check()
     order = np.argsort(nu)
-    nu, t = nu[order], t[order]
-    most, least = GIGAHERTZ_MAX * 1e9, GIGAHERTZ_MIN * 1e9
+    nu = nu[order]
+    t = t[order]
+    most = GIGAHERTZ_MAX * 1e9
+    least = GIGAHERTZ_MIN * 1e9
     for wrong, text in (
         (len(nu) < 2, "has one row"),
         (nu[-1] > most, f"has a frequency above {GIGAHERTZ_MAX:g} GHz"),

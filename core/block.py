@@ -145,7 +145,8 @@ class Block:
 
     def buffer(self, name: str, shape: tuple[int, int]) -> AnyFloats:
         """An uninitialized array of `dtype`, reused between blocks under this name."""
-        size, key = shape[0] * shape[1], name + self.suffix
+        size = shape[0] * shape[1]
+        key = name + self.suffix
         held = self.buffers.get(key)
         if held is None or held.size < size or held.dtype != self.dtype:
             held = self.buffers[key] = np.empty(size, self.dtype)

@@ -136,7 +136,8 @@ class Data:
         the step of this label reads.
         """
         for what in ("instrument", "site"):
-            one, other = own[what].name, getattr(self.scene, what).name
+            one = own[what].name
+            other = getattr(self.scene, what).name
             text = f"{one}, the file's"
             if one != other:
                 use = "is not used" if what == "site" else "gives what it does not state"
@@ -313,7 +314,8 @@ class KeptStream(np.ndarray[Any, np.dtype[np.float64]]):
         """
         from .plots import draw_stream
 
-        scan, n = self.scan, len(self)
+        scan = self.scan
+        n = len(self)
         if scan is None:
             cure = "draw data.tod(...) itself"
             raise InputError("a copy of a stream does not know its scan", place="plot", cure=cure)
@@ -324,7 +326,8 @@ class KeptStream(np.ndarray[Any, np.dtype[np.float64]]):
         if wrong := [k for k in rows if not -n <= k < n]:
             cure = f"choose from 0 to {n - 1}"
             raise InputError(f"there is no detector {wrong[0]}", place=scan.name, cure=cure)
-        ax, names = shown_axes(ax, (8.0, 4.0)), [scan.focalplane.names[k] for k in rows]
+        ax = shown_axes(ax, (8.0, 4.0))
+        names = [scan.focalplane.names[k] for k in rows]
         draw_stream(
             ax,
             self.stream,

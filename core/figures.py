@@ -201,7 +201,8 @@ class Choice(TextValue):
         try:
             return cls.parse(value)
         except PydanticCustomError as err:
-            told, message = err.context or {}, err.message().removeprefix("metric: ")
+            told = err.context or {}
+            message = err.message().removeprefix("metric: ")
             cure = str(told.get("help") or told.get("label", ""))
             raise InputError(message, place="metric", cure=cure) from None
 

@@ -249,14 +249,17 @@ class Instrument(ParametersWithYield):
         for k, name in enumerate(names):
             cure = "give each a name of its own: products and files bear it"
             yield name in names[:k], f"two bands are called {name}", cure, ("bands", k, "name")
-        none, cure = self.band is None and not names, "name one with band, or several with bands"
+        none = self.band is None and not names
+        cure = "name one with band, or several with bands"
         yield none, "a camera needs a band", cure, ("band",)
         if self.focalplane_table is not None:
             lost = any(getattr(part, "yield") not in (None, 1.0) for part in (self, *self.bands))
             cure = "leave it out: the column `dead` of the table tells which detectors give no data"
             yield lost, "yield is for layouts, not for a table of detectors", cure, ("yield",)
             return
-        counts, wafers, pairs = self._counts, self._wafers, self.polarization == "pairs"
+        counts = self._counts
+        wafers = self._wafers
+        pairs = self.polarization == "pairs"
         listed = ", ".join(f"{name} has {number}" for name, number in counts.items())
         yield (
             self.pixels == "shared" and len(set(counts.values())) > 1,
@@ -399,7 +402,8 @@ class Instrument(ParametersWithYield):
         field of view.
         """
         x, y = hexagonal_packing(len(self.bands))
-        x, y = x - x.mean(), y - y.mean()
+        x = x - x.mean()
+        y = y - y.mean()
         whole = float(np.hypot(x, y).max()) + ARRAY
         return x / whole, y / whole, ARRAY / whole
 
@@ -434,7 +438,8 @@ class Instrument(ParametersWithYield):
         stated = {key: getattr(self, key) for key in OF_INSTRUMENT} | {"fwhm": self.beam_fwhm}
         if self.focalplane_table is not None:
             return read_array(self.focalplane_table).plane(self.band.name, stated)
-        pair, n = self._pair, self.detectors
+        pair = self._pair
+        n = self.detectors
         pixels = n // pair
         layout = self._pixels(pixels)
         scale = math.tan(self.field_of_view / 2) / layout.reach if layout.reach > 0 else 0.0

@@ -63,7 +63,9 @@ def rings(n: int) -> tuple[Floats, Floats]:
     """``n`` points on rings one unit apart: one in the centre, 6 k on ring k, what is left evenly
     on the last.
     """
-    x, y, k = [np.zeros(1)], [np.zeros(1)], 0
+    x = [np.zeros(1)]
+    y = [np.zeros(1)]
+    k = 0
     left = n - 1
     while left > 0:
         k += 1
@@ -98,7 +100,8 @@ def wafers(n: int, number: int) -> tuple[Floats, Floats, Integers]:
     apothem = math.sqrt(3) / 2 * max(float(np.abs(x).max()), 1.0)
     distance = (2 * apothem + 1) * (1 + GAP)
     v, u = _compact(number)  # neighbours at 30 deg: across the edges of a wafer
-    u, v = distance * (u - u.mean()), distance * (v - v.mean())
+    u = distance * (u - u.mean())
+    v = distance * (v - v.mean())
     return (
         np.add.outer(u, x).ravel(),
         np.add.outer(v, y).ravel(),

@@ -105,7 +105,8 @@ class CalibratedSignal(Operator):
         return "(sky as signal)" if self._reads == {"sky"} else "(sum as signal)"
 
     def exec(self, block: Block, state: Any) -> None:
-        out, empty = block.new(MAIN, zero=False), True
+        out = block.new(MAIN, zero=False)
+        empty = True
         names = [
             name for name in sorted(self._reads) if name in block.detdata
         ]  # a signal without the sky has none

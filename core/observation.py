@@ -113,7 +113,8 @@ class KeptStreams(MutableMapping[str, AnyFloats]):
     """
 
     def __init__(self, parts: Mapping[str, tuple[AnyFloats, Any]] | None = None) -> None:
-        self.parts, self.given = dict(parts or {}), dict[str, AnyFloats]()
+        self.parts = dict(parts or {})
+        self.given = dict[str, AnyFloats]()
 
     @property
     def every(self) -> dict[str, tuple[AnyFloats, Any]]:
@@ -388,7 +389,8 @@ class Observation:
 
     def looks_as(self, other: Observation) -> bool:
         """Tell whether the detectors are where those of another band of the scan are."""
-        one, two = self.focalplane, other.focalplane
+        one = self.focalplane
+        two = other.focalplane
         return np.array_equal(one.xi, two.xi) and np.array_equal(one.eta, two.eta)
 
     def once(self, key: Hashable, make: Callable[[], T]) -> T:
@@ -513,7 +515,9 @@ class Observation:
 
             T_scan = < eps T_atm / (zeta e^-tau) >.                                              (1)
         """
-        smooth, plane, good = self.smooth, self.focalplane, self.good_detectors
+        smooth = self.smooth
+        plane = self.focalplane
+        good = self.good_detectors
         if not ({"atmosphere", "transmission"} <= smooth.keys() and good.any()):
             return {}
         every = slice(0, len(plane))

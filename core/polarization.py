@@ -66,7 +66,8 @@ class PolarizationAngles(NamedTuple):
         quaternions = detector_quaternions(plane.xi, plane.eta, plane.polarization_angle)
         axes = np.ascontiguousarray(np.moveaxis(rotation_matrices(quaternions)[:, :, :2], 2, 1))
         turn = 4 * plane.polarization_angle
-        chi, plate = observation.hwp_angle, np.zeros((2, 0))
+        chi = observation.hwp_angle
+        plate = np.zeros((2, 0))
         if chi is not None:
             plate = np.stack([np.cos(4 * chi), np.sin(4 * chi)])
         return cls(

@@ -40,7 +40,9 @@ from .signal import is_stream
 from .site import Site
 from .types import Floats
 
-N_DETECTORS, N_SAMPLES, RATE = 37, 3 * TILE_SAMPLES + 321, 50.0
+N_DETECTORS = 37
+N_SAMPLES = 3 * TILE_SAMPLES + 321
+RATE = 50.0
 
 
 class Points(Operator):
@@ -75,7 +77,8 @@ class Given(Operator):
         return field
 
     def exec(self, block: Block, state: Any) -> None:
-        start, stop = block.samples.start, block.samples.stop
+        start = block.samples.start
+        stop = block.samples.stop
         wave = np.sin(np.arange(start, stop) / RATE / 3.0)
         for number, name in enumerate(STREAMS):
             stream = block.new(name)
@@ -139,9 +142,11 @@ def made_up_scan() -> Observation:
     """A scan in circles of 5 arcmin around RA 75 deg, Dec 20 deg, at 60 deg of elevation."""
     scene = made_up_scene()
     t = np.arange(N_SAMPLES) / RATE
-    ra, dec = np.radians(75.0), np.radians(20.0)
+    ra = np.radians(75.0)
+    dec = np.radians(20.0)
     reach = np.radians(5 / 60)
-    x, y = reach * np.cos(t / 3), reach * np.sin(t / 3)
+    x = reach * np.cos(t / 3)
+    y = reach * np.sin(t / 3)
     return Observation(
         "scan-000",
         0,
@@ -322,7 +327,8 @@ def check_linear(operator: Operator) -> None:
     state = operator.prepare(observation)
     parts = [given_signal(observation, factor) for factor in (1.0, -0.3)]
     parts[1][:, ::7] += np.float32(2e-3)
-    whole, nothing = parts[0] + parts[1], np.zeros_like(parts[0])
+    whole = parts[0] + parts[1]
+    nothing = np.zeros_like(parts[0])
     model = (
         operator.measure(_stream(observation, whole, state)) if operator.couples == "all" else None
     )
@@ -515,7 +521,8 @@ def _unlike(a: Any, b: Any, name: str = "") -> str | None:
         )
     if b is None or a is None:
         return None if a is b else name
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    a = np.asarray(a, np.float64)
+    b = np.asarray(b, np.float64)
     if a.shape != b.shape or (np.isfinite(a) != np.isfinite(b)).any():
         return name
     good = np.isfinite(b)

@@ -65,7 +65,8 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
     """
     scene = None
     if isinstance(source, Data):
-        scene, source = source.scene, one_scan(source.observations, scan)
+        scene = source.scene
+        source = one_scan(source.observations, scan)
     elif scan is not None:
         raise InputError(
             "scan chooses from the scans of a run",
@@ -73,7 +74,8 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
             cure="leave it out: there is one",
         )
     if isinstance(source, Observation):
-        values, flagged = kept(source, stream), None
+        values = kept(source, stream)
+        flagged = None
         tod = TimeOrderedData.of(source)
         if (
             scene is not None and tod.weather is None
@@ -83,7 +85,9 @@ def scan_of(source: Source, stream: str = "signal", scan: str | int | None = Non
     elif isinstance(source, TimeOrderedData):
         if stream not in source.streams:
             raise _absent(stream, source.streams, source.name)
-        tod, values, flagged = source, np.asarray(source.streams[stream], np.float64), None
+        tod = source
+        values = np.asarray(source.streams[stream], np.float64)
+        flagged = None
     else:
         tod, values, flagged = _read(source, stream)
     spoilt = ~np.isfinite(values)
@@ -102,7 +106,8 @@ def _read(
         tod = opened.tod
         if stream not in opened.streams:
             raise _absent(stream, opened.streams, str(path))
-        every, whole = np.arange(tod.n_detectors), slice(0, tod.n_samples)
+        every = np.arange(tod.n_detectors)
+        whole = slice(0, tod.n_samples)
         values, _ = RecordedStream(opened, stream, every, np.uint8(0)).read(
             slice(0, tod.n_detectors),
             whole,

@@ -237,7 +237,8 @@ def _scans(tod: TimeOrderedData) -> dict[str, Bools]:
 
 
 def _det_info(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
-    names, n = np.array(tod.names), tod.n_detectors
+    names = np.array(tod.names)
+    n = tod.n_detectors
     centre = tod.columns.get("band_centre", np.full(n, np.nan))
     band = np.array(
         [str(tod.metadata["band"])] * n
@@ -265,7 +266,8 @@ def _det_cal(core: Any, aman: Any, tod: TimeOrderedData) -> Any:
 
 def _obs_info(core: Any, tod: TimeOrderedData) -> Any:
     info = core.AxisManager()
-    first, last = float(tod.times[0]), float(tod.times[-1])
+    first = float(tod.times[0])
+    last = float(tod.times[-1])
     about = {
         "obs_id": tod.name,
         "telescope": tod.telescope,

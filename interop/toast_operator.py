@@ -106,7 +106,8 @@ class ToastOperator(Operator):
         ob = _in_toast(observation, {})
         operator = made(self.operator, self.traits)
         try:
-            wanted, makes = operator.requires(), operator.provides()
+            wanted = operator.requires()
+            makes = operator.provides()
         except Exception:  # SimAtmosphere of TOAST 3.0.6 cannot say it
             return
         for kind, there in {
@@ -134,7 +135,8 @@ class ToastOperator(Operator):
         """Let it act. Raises PipelineError with what it says where it cannot."""
         import toast
 
-        shape, place = ob.detdata["signal"].data.shape, f"{self.label}, {observation.name}"
+        shape = ob.detdata["signal"].data.shape
+        place = f"{self.label}, {observation.name}"
         data = toast.Data(ob.comm)
         data.obs.append(ob)
         try:
@@ -167,7 +169,8 @@ class ToastOperator(Operator):
             spoilt = ~np.isfinite(values)
             ob = _in_toast(observation, {"signal": values})
             ob.detdata["signal"].data[spoilt] = 0.0
-            before, sums = ob.detdata["flags"].data.copy(), _sums(ob)
+            before = ob.detdata["flags"].data.copy()
+            sums = _sums(ob)
             self._apply(ob, observation)
             if np.array_equal(sums, _sums(ob)) and np.array_equal(before, ob.detdata["flags"].data):
                 observation.log.state(
@@ -262,7 +265,8 @@ def _newly_flagged(label: str, stream: Stream, ob: Any, before: Any) -> Any:
         [ob.local_detector_flags[name] for name in ob.local_detectors],
         np.uint8,
     ) & np.uint8(DETECTOR_MASK)
-    used, good = observation.good_detectors, observation.good_samples
+    used = observation.good_detectors
+    good = observation.good_samples
     new = (ob.detdata["flags"].data & ~before & np.uint8(DETECTOR_MASK)) != 0
     new[:, ~good] = False
     new[~used | (own != 0)] = False

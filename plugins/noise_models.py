@@ -75,8 +75,11 @@ class BackgroundLimited(NoiseModel):
 
     def net(self, observation: Observation) -> Floats:
         """See `NoiseModel.net`. Without an atmosphere in the pipeline the load has none."""
-        plane, smooth, n = observation.focalplane, observation.smooth, observation.n_detectors
-        epsilon, polarized = plane.illumination_efficiency, plane.polarization_efficiency
+        plane = observation.focalplane
+        smooth = observation.smooth
+        n = observation.n_detectors
+        epsilon = plane.illumination_efficiency
+        polarized = plane.polarization_efficiency
         emission = smooth["atmosphere"].time_mean() if "atmosphere" in smooth else np.zeros(n)
         transmission = (
             smooth["transmission"].time_mean() if "transmission" in smooth else np.ones(n)
@@ -125,12 +128,11 @@ class BackgroundLimited(NoiseModel):
             np.arange(len(band.frequency)),
             band.frequency,
         )
-        t, step = np.interp(nu, band.frequency, band.transmission), np.diff(nu)
+        t = np.interp(nu, band.frequency, band.transmission)
+        step = np.diff(nu)
         middle = (nu[1:] + nu[:-1]) / 2
-        width, square = (
-            step * (t[1:] + t[:-1]) / 2,
-            step * (t[1:] ** 2 + t[1:] * t[:-1] + t[:-1] ** 2) / 3,
-        )
+        width = step * (t[1:] + t[:-1]) / 2
+        square = step * (t[1:] ** 2 + t[1:] * t[:-1] + t[:-1] ** 2) / 3
         moments = _Moments.of(middle, width, square, rayleigh_jeans(middle, T_CMB)[None])
         return self._net(
             moments,

@@ -98,7 +98,8 @@ class ProcessPool(Pool):
         count = workers or available_threads()
         share = (memory or available_memory() // 2) // count
         super().__init__(None, count, 1, threads, share, memory)
-        self.fixed, self._asked_threads = workers is not None, threads
+        self.fixed = workers is not None
+        self._asked_threads = threads
         self.start()
 
     def start(self, workers: int | None = None) -> bool:
@@ -251,7 +252,8 @@ def _mpi(threads: int | None, memory: int | None) -> Iterator[Pool]:
         mpi = needed("mpi4py.MPI", "mpi", "engine mpi")
         futures = needed("mpi4py.futures", "mpi", "engine mpi")
     except RuntimeError as err:  # mpi4py is there, the library is not
-        text, cure = f"MPI cannot be loaded: {first_line(err)}", "install Open MPI or MPICH"
+        text = f"MPI cannot be loaded: {first_line(err)}"
+        cure = "install Open MPI or MPICH"
         raise PipelineError(text, place="engine mpi", cure=cure) from None
     size = mpi.COMM_WORLD.Get_size()
     if size < 2:
@@ -304,7 +306,8 @@ def _dask(
                 " nowhere of itself"
             ),
         )
-    security, cure = None, "is it running there?"
+    security = None
+    cure = "is it running there?"
     if tls is not None:
         security = distributed.Security(
             tls_ca_file=tls.ca_file,
@@ -505,13 +508,15 @@ def share_out(pool: Pool, need: int, place: str) -> None:
     if not isinstance(pool, ProcessPool):
         _each(pool, need, place)
         return
-    main, free = max(resident_memory() + GROWTH, MAIN), available_memory()
+    main = max(resident_memory() + GROWTH, MAIN)
+    free = available_memory()
     budget = pool.asked - main if pool.asked else max(free // 2, min(need, free))
     fitting = max(budget // need, 0)
     if fitting < (pool.workers if pool.fixed else 1):
         if pool.asked or pool.workers * need > free:
             _refuse(pool, need, main, place)
-        budget, fitting = pool.workers * need, pool.workers
+        budget = pool.workers * need
+        fitting = pool.workers
     if fitting < pool.workers:
         pool.start(fitting)
     pool.memory = budget // pool.workers

@@ -247,8 +247,10 @@ class ImagePixels(MapGrid):
             )
             return np.asarray(flat / (secant * np.sqrt(secant)))
         if self.kind == "CAR" and self.cylinder:
-            dx, dy = abs(float(self.matrix[0, 0])), abs(float(self.matrix[1, 1]))
-            rows, pole = self.latitudes[:, None], math.pi / 2
+            dx = abs(float(self.matrix[0, 0]))
+            dy = abs(float(self.matrix[1, 1]))
+            rows = self.latitudes[:, None]
+            pole = math.pi / 2
             low, high = (np.clip(rows + side, -pole, pole) for side in (-dy / 2, dy / 2))
             found = dx * 2 * np.sin((high - low) / 2) * np.cos((low + high) / 2)
             return np.where(abs(rows) <= pole * (1 + 1e-12), found, np.nan)
@@ -297,7 +299,8 @@ class ImagePixels(MapGrid):
             x, y = self._unbounded.all_world2pix(*pair, 0, quiet=True)
         else:
             x, y = self._unbounded.wcs_world2pix(*pair, 0)
-        x, y = np.where(known, x, np.nan), np.where(known, y, np.nan)
+        x = np.where(known, x, np.nan)
+        y = np.where(known, y, np.nan)
         if self.cylinder:
             turn = 2 * math.pi / abs(float(self.matrix[0, 0]))
             x = x - turn * np.floor((x + 0.5) / turn)

@@ -47,7 +47,8 @@ class FileHeader:
     """Header of the FITS file that messages call ``place``; cards are checked as they are read."""
 
     def __init__(self, header: Any, place: str) -> None:
-        self.header, self.place = header, place
+        self.header = header
+        self.place = place
 
     def error(self, message: str, cure: str) -> InputError:
         """An error about the file, to be raised."""
@@ -101,7 +102,8 @@ def marked_bad(values: AnyFloats, header: FileHeader) -> Bools:
 
     Raises InputError where BAD_DATA is no number.
     """
-    stated, found = header.number("BAD_DATA"), np.zeros(values.shape, bool)
+    stated = header.number("BAD_DATA")
+    found = np.zeros(values.shape, bool)
     with np.errstate(over="ignore", invalid="ignore"):
         for bad in {UNSEEN} | (set() if stated is None else {stated}):
             found |= np.abs(values - bad) <= 1e-5 * abs(bad)
@@ -149,14 +151,17 @@ def with_known_frame(header: Any, place: str) -> tuple[Any, str]:
         if _NUMBERS.fullmatch(key) and about.number(key) is None:
             made.remove(key, ignore_missing=True)
     for axis in "12":
-        key, unit = f"CRVAL{axis}", about.text(f"CUNIT{axis}") or "deg"
+        key = f"CRVAL{axis}"
+        unit = about.text(f"CUNIT{axis}") or "deg"
         degrees = Unit(ANGLES.get(unit, "deg")).to("deg")
         if abs(about.number(key) or 0.0) * degrees > 720.0:
             cure = f"correct {key}, or the unit CUNIT{axis}"
             raise about.error(f"{key} = {made[key]:g} {unit} is no longitude or latitude", cure)
-        width, key = abs(about.number(f"CDELT{axis}") or 1.0), f"CDELT{axis}"
+        width = abs(about.number(f"CDELT{axis}") or 1.0)
+        key = f"CDELT{axis}"
         if rows := [about.number(f"CD{row}_{axis}") for row in "12" if f"CD{row}_{axis}" in made]:
-            width, key = math.hypot(*(each or 0.0 for each in rows)), f"CD1_{axis}, CD2_{axis}"
+            width = math.hypot(*(each or 0.0 for each in rows))
+            key = f"CD1_{axis}, CD2_{axis}"
         if is_celestial(made, axis) and width * degrees < SMALLEST_PIXEL:
             text = f"{width:g} {unit} is no size of a pixel, which is 1e-6 arcsec or more"
             raise about.error(f"{key}: {text}", f"check {key}, and its unit")
@@ -192,7 +197,8 @@ def exact_header(wcs: Any) -> Header:
 
     Time and rest frequency of the observation are left out.
     """
-    header, numbers = wcs.to_header(relax=True), wcs.wcs
+    header = wcs.to_header(relax=True)
+    numbers = wcs.wcs
     exact: dict[str, float] = {}
     for i in range(numbers.naxis):
         for key, values in (

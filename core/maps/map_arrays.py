@@ -81,7 +81,8 @@ def _plane(product: MapArrays, size: int) -> tuple[Any, tuple[int, int]]:
     x, y = wcs.wcs_world2pix(longitudes, latitudes, 0)
     spare = math.degrees(product.pixel)
     places = np.stack([x, y]) if x.size else np.zeros((2, 1))
-    low, high = places.min(axis=1) - spare, places.max(axis=1) + spare
+    low = places.min(axis=1) - spare
+    high = places.max(axis=1) + spare
     step = float((high - low).max()) / size
     numbers = np.maximum(1, np.ceil((high - low) / step - 1e-9)).astype(int)
     wcs.wcs.cdelt = [-step, step]
@@ -219,7 +220,10 @@ class MapArrays:
         map has no such plane. They take the place of those among ``planes``.
         """
         self.planes = dict(more.pop("planes", {}))
-        self.header, self.centre, self.pixel, self.frame = header, centre, pixel, frame
+        self.header = header
+        self.centre = centre
+        self.pixel = pixel
+        self.frame = frame
         planes = {"hits": hits, "signal": signal, "weights": weights, "noise": noise}
         planes["half_difference"] = half_difference
         for name, value in more.items():
@@ -418,10 +422,8 @@ class MapArrays:
         """
         if not (self.sample_rate > 0 and self.fwhm > 0):
             return None
-        beam, areas = (
-            math.pi / math.log(16) * self.fwhm**2 / self.sample_rate,
-            np.asarray(self.areas()),
-        )
+        beam = math.pi / math.log(16) * self.fwhm**2 / self.sample_rate
+        areas = np.asarray(self.areas())
         if areas.max() < 1.001 * areas.min():
             return beam / (float(areas.mean()) if self.projection == "CAR" else self.pixel**2)
         return np.broadcast_to(beam / areas, self.signal.shape)

@@ -192,7 +192,8 @@ class MapProduct(MapArrays):
         if self.polarization is not None:
             return self._with_parts([one.smoothed(fwhm) for one in self.by_stokes().values()])
         convolve = smoother(self.grid, fwhm)
-        known, planes = self.known, self._smoothable
+        known = self.known
+        planes = self._smoothable
         total: Any = None
         weights = np.where(known, self.weights, 0.0)
         for name, plane in planes.items():  # the signal is the first

@@ -111,7 +111,9 @@ def chosen(hdus: Any, wanted: int | str | None, place: str) -> tuple[Any, dict[s
     Raises InputError if there is none, or it is no map: a HEALPix table, or an image of two axes or
     more.
     """
-    name, contents, about = str(wanted).strip().upper(), _contents(hdus), FileHeader({}, place)
+    name = str(wanted).strip().upper()
+    contents = _contents(hdus)
+    about = FileHeader({}, place)
     asked = [
         hdu
         for k, hdu in enumerate(hdus)
@@ -165,7 +167,8 @@ def celestial(hdu: Any, place: str) -> tuple[Cube, Any, str]:
     from astropy.wcs import WCS
 
     header, note = with_known_frame(hdu.header, place)
-    wcs, shape = WCS(header), hdu.shape
+    wcs = WCS(header)
+    shape = hdu.shape
     if not wcs.has_celestial:
         kinds = ", ".join(str(header.get(f"CTYPE{k}", "none")) for k in (1, 2))
         message = f"is not a map: it has no celestial coordinates (CTYPE: {kinds})"
@@ -224,7 +227,8 @@ class Cube(FileHeader):
                 f" {', '.join(f'{axis} ({self.names[axis]})' for axis in stray)}",
                 "transpose it, so that axes 1 and 2 are longitude and latitude",
             )
-        numbers, planes = self._numbers(wanted), []
+        numbers = self._numbers(wanted)
+        planes = []
         notes: dict[str, str] = {}
         for axis, length in self.lengths.items():
             if self.names[axis] == "STOKES":
@@ -238,7 +242,8 @@ class Cube(FileHeader):
 
     def _numbers(self, wanted: Index | None) -> dict[int, int]:
         """The number of the wanted plane by axis."""
-        lengths, asked = self.lengths, self.asked
+        lengths = self.lengths
+        asked = self.asked
         ranges = ", ".join(
             f"1 to {lengths[axis]} along {self.names[axis] or f'axis {axis}'}" for axis in asked
         )
@@ -267,7 +272,9 @@ class Cube(FileHeader):
         return found
 
     def _which(self, axis: int, plane: int) -> str:
-        header, name, unit = self.header, self._word("CTYPE", axis), self._word("CUNIT", axis)
+        header = self.header
+        name = self._word("CTYPE", axis)
+        unit = self._word("CUNIT", axis)
         told = f"{plane} of {self.lengths[axis]}{f' along {name}' if name else ''}"
         try:
             step = header.get(f"CDELT{axis}", header.get(f"CD{axis}_{axis}"))
@@ -401,7 +408,9 @@ class HealpixTable(FileHeader):
         InputError
             There is no such column; none may be I; several may be.
         """
-        names, pixel, there = self.names, self.pixel_column, ", ".join(self.names)
+        names = self.names
+        pixel = self.pixel_column
+        there = ", ".join(self.names)
         if wanted is not None:
             name = str(wanted).strip().upper()
             same = [k for k, n in enumerate(names) if name in (n.strip().upper(), str(k + 1))]
@@ -446,10 +455,12 @@ class HealpixTable(FileHeader):
             n = int(self.header.get("NAXIS2", 0)) * int((repeat and repeat[1]) or 1)
             return {"I": np.zeros(0)}, None, self._nside(n)
         values = np.stack([self._numbers(k) for k in columns.values()])
-        nside, n = self._nside(values.shape[1]), values.shape[1]
+        nside = self._nside(values.shape[1])
+        n = values.shape[1]
         if (pixels := self._pixels(nside, n)) is not None:
             order = np.argsort(pixels, kind="stable")
-            pixels, values = pixels[order], values[:, order]
+            pixels = pixels[order]
+            values = values[:, order]
         unseen = marked_bad(values, self)
         values[1:][unseen[1:]] = np.nan
         if unseen[0].any():
@@ -469,7 +480,8 @@ class HealpixTable(FileHeader):
         """The numbers of the pixels of ``n`` values."""
         if (column := self.pixel_column) is None:
             return None
-        found, name = self._numbers(column), self.names[column]
+        found = self._numbers(column)
+        name = self.names[column]
         if (
             len(found) != n
             or not np.isfinite(found).all()

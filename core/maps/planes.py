@@ -51,7 +51,8 @@ def noise_factor(noise: Floats, alone: Floats) -> float | None:
     white noise is to be multiplied by, so that noise that is correlated between pixels (1/f noise,
     the atmosphere) counts in full. None where it cannot be measured."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        weight, ratio = noise**-2.0, alone / noise
+        weight = noise**-2.0
+        ratio = alone / noise
     known = np.isfinite(ratio) & np.isfinite(weight)
     if not known.any():
         return None
@@ -276,7 +277,8 @@ class Rows(Generic[T]):
     """
 
     def __init__(self, plane: str, rows: Any = 0) -> None:
-        self._plane, self._rows = plane, rows
+        self._plane = plane
+        self._rows = rows
 
     def __get__(self, owner: Any, kind: type) -> T:
         if owner is None:

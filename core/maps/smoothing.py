@@ -198,7 +198,8 @@ def _by_tiles(grid: ImagePixels, sigma: float, reach: tuple[int, int]) -> Smooth
     """Smoother of a large image: tile by tile where one kernel serves a tile, else pixel by
     pixel.
     """
-    halo, rest = [math.ceil(1.2 * n) + 2 for n in reach], np.zeros(grid.shape, np.bool_)
+    halo = [math.ceil(1.2 * n) + 2 for n in reach]
+    rest = np.zeros(grid.shape, np.bool_)
     tiles = []
     for tile, steps in _tiles(grid, *(slice(0, n) for n in grid.shape)):
         if steps is None:
@@ -225,10 +226,12 @@ def _tiles(
     """Halves of halves of the image, until each is even or of no more than `TILE` pixels a side;
     and its steps, None where these differ.
     """
-    steps, sides = _even_steps(grid.window(*tile)), [own.stop - own.start for own in tile]
+    steps = _even_steps(grid.window(*tile))
+    sides = [own.stop - own.start for own in tile]
     if steps is not None or max(sides) <= TILE:
         return [(tile, steps)]
-    along, found = int(sides[1] > sides[0]), []
+    along = int(sides[1] > sides[0])
+    found = []
     middle = tile[along].start + sides[along] // 2
     for half in (slice(tile[along].start, middle), slice(middle, tile[along].stop)):
         found += _tiles(grid, *((tile[0], half) if along else (half, tile[1])))
@@ -237,7 +240,8 @@ def _tiles(
 
 def _by_latitudes(grid: ImagePixels, sigma: float) -> Smoother:
     """Smoother of a large CAR image: row by row, but near the poles pixel by pixel."""
-    rows, poles = _by_rows(grid, sigma, both=True), []
+    rows = _by_rows(grid, sigma, both=True)
+    poles = []
     for pole in (-1, 1):
         near = sigma * np.sin(pole * grid.latitudes) >= STEEP * np.cos(grid.latitudes)
         if near.any():
@@ -260,15 +264,14 @@ def _by_rows(grid: ImagePixels, sigma: float, both: bool = False) -> Smoother:
     then. The widths go with cos(latitude) of the pixel that is seen, and of the one that sees it;
     so has r^2 the mean of both: right to the square.
     """
-    side, taps = (
-        abs(float(grid.matrix[0, 0])),
-        gaussian_taps(sigma / abs(float(grid.matrix[1, 1]))),
-    )
+    side = abs(float(grid.matrix[0, 0]))
+    taps = gaussian_taps(sigma / abs(float(grid.matrix[1, 1])))
     cosines = np.cos(grid.latitudes)
     if both:  # rows nearer to a pole are left to `_directly`
         cosines = np.maximum(cosines, sigma / 2 / STEEP)
     rows = [gaussian_taps(sigma / side / cosine) for cosine in cosines]
-    around, nx = grid.around, grid.shape[1]
+    around = grid.around
+    nx = grid.shape[1]
     columns: Any = slice(None)
     own: Any = columns
     if 0 < around <= nx:
@@ -322,7 +325,8 @@ def _directly(
     columns = grid.around if whole else nx
     where = np.broadcast_to(where, grid.shape)[:, :columns]
     wanted = np.flatnonzero(where.any(axis=1))
-    across, reach = np.arange(columns, dtype=np.float64), np.zeros((2, ny, columns), np.int32)
+    across = np.arange(columns, dtype=np.float64)
+    reach = np.zeros((2, ny, columns), np.int32)
     for part in np.array_split(wanted, math.ceil(len(wanted) / ROWS) or 1):
         xx, xy, yy = grid.metric(across, part[:, None])
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -341,7 +345,8 @@ def _directly(
             cure="smooth it less, cut off the poles of a CAR map, or make a HEALPix map (nside)",
         )
     high = int(reach[1].max(initial=0))
-    first, stop = wanted.min(initial=ny) - high, wanted.max(initial=-1) + high + 1
+    first = wanted.min(initial=ny) - high
+    stop = wanted.max(initial=-1) + high + 1
     seen = slice(max(int(first), 0), min(int(stop), ny))
     rows = np.arange(ny)[seen]
     parts = np.array_split(rows, math.ceil(len(rows) / ROWS) or 1)

@@ -76,7 +76,8 @@ def tracks(site: Site, times: Floats, *what: Target | str) -> list[Track]:
             "ignore",
             erfa.ErfaWarning,
         )  # "dubious year": leap seconds to come are unknown
-        jd, days = np.full(len(times), 2440587.5), times / DAY
+        jd = np.full(len(times), 2440587.5)
+        days = times / DAY
         earth = orientation(jd - 2400000.5 + days)
         place = (site.longitude, site.latitude, site.altitude, earth.x, earth.y)
         star, _ = erfa.apco13(jd, days, earth.ut1_utc, *place, 0.0, 0.0, 0.0, 1.0)

@@ -45,7 +45,9 @@ def rotate(a: Floats, vector: Floats) -> Floats:
     """Vectors (n, 3) or (3,) turned by quaternions (n, 4)."""
     qx, qy, qz, w = a.T
     vx, vy, vz = vector.T
-    tx, ty, tz = 2 * (qy * vz - qz * vy), 2 * (qz * vx - qx * vz), 2 * (qx * vy - qy * vx)
+    tx = 2 * (qy * vz - qz * vy)
+    ty = 2 * (qz * vx - qx * vz)
+    tz = 2 * (qx * vy - qy * vx)
     return np.stack(
         [
             vx + w * tx + qy * tz - qz * ty,
@@ -82,8 +84,12 @@ def shortest_rotation(a: Floats, b: Floats) -> Floats:
 
 def from_angles(longitude: Any, latitude: Any) -> Floats:
     """TOAST's Rz(longitude) Ry(pi/2 - latitude), psi = 0: (n, 4)."""
-    a, b = np.asarray(longitude) / 2, np.pi / 4 - np.asarray(latitude) / 2
-    ca, sa, cb, sb = np.cos(a), np.sin(a), np.cos(b), np.sin(b)
+    a = np.asarray(longitude) / 2
+    b = np.pi / 4 - np.asarray(latitude) / 2
+    ca = np.cos(a)
+    sa = np.sin(a)
+    cb = np.cos(b)
+    sb = np.sin(b)
     quaternions: Floats = np.moveaxis(np.array([-sa * sb, ca * sb, sa * cb, ca * cb]), 0, -1)
     return quaternions
 
@@ -95,9 +101,11 @@ def detector_quaternions(xi: Any, eta: Any, angle: Any) -> Floats:
     q = Rz(phi) Ry(theta) Rz(angle - phi), theta = atan |(xi, eta)|, phi = atan2(-xi, -eta); see
     `core.focalplane.Focalplane`.
     """
-    half, phi = np.arctan(np.hypot(xi, eta)) / 2, np.arctan2(-np.asarray(xi), -np.asarray(eta))
+    half = np.arctan(np.hypot(xi, eta)) / 2
+    phi = np.arctan2(-np.asarray(xi), -np.asarray(eta))
     roll = np.asarray(angle) / 2
-    x, y = -np.sin(half) * np.sin(phi - roll), np.sin(half) * np.cos(phi - roll)
+    x = -np.sin(half) * np.sin(phi - roll)
+    y = np.sin(half) * np.cos(phi - roll)
     return np.stack([x, y, np.cos(half) * np.sin(roll), np.cos(half) * np.cos(roll)], 1)
 
 
@@ -134,8 +142,12 @@ class Upright:
     def _by_half_angles(self, x: Floats, y: Floats, z: Floats, r: Floats, cosine: Floats) -> Floats:
         sine = y * math.cos(self._first) - x * math.sin(self._first)  # times r
         self._last = self._first + math.atan2(sine[-1], r[-1] * cosine[-1])
-        cl, cb = np.sqrt((1 + cosine) / 2), np.sqrt((1 + z) / 2)
-        sl, sb = sine / (2 * r * cl), r / (2 * cb)
-        c, s = math.cos(self._first / 2), math.sin(self._first / 2)
-        ca, sa = c * cl - s * sl, s * cl + c * sl
+        cl = np.sqrt((1 + cosine) / 2)
+        cb = np.sqrt((1 + z) / 2)
+        sl = sine / (2 * r * cl)
+        sb = r / (2 * cb)
+        c = math.cos(self._first / 2)
+        s = math.sin(self._first / 2)
+        ca = c * cl - s * sl
+        sa = s * cl + c * sl
         return np.stack([-sa * sb, ca * sb, sa * cb, ca * cb]).T

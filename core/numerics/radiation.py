@@ -45,7 +45,8 @@ def rayleigh_jeans(frequency: ArrayLike, temperature: ArrayLike) -> Floats:
     """Rayleigh-Jeans brightness of a black body, J = (h nu / k) / (exp(h nu / k T) - 1). Hz, K ->
     K; shapes broadcast.
     """
-    nu, temperature = np.asarray(frequency, np.float64), np.asarray(temperature, np.float64)
+    nu = np.asarray(frequency, np.float64)
+    temperature = np.asarray(temperature, np.float64)
     x = PLANCK * nu / (BOLTZMANN * temperature)
     with np.errstate(over="ignore"):
         return temperature * x / np.expm1(x)
@@ -98,7 +99,8 @@ def sz_terms(frequency: ArrayLike) -> Floats:
     x = PLANCK * np.asarray(frequency, np.float64) / (BOLTZMANN * T_CMB)
     with np.errstate(over="ignore"):
         n = 1 / np.expm1(x)
-    derivative, slopes = np.polynomial.Polynomial([0.0, 1.0]), []
+    derivative = np.polynomial.Polynomial([0.0, 1.0])
+    slopes = []
     for k in range(1, len(SZ_SERIES[-1]) + 1):
         derivative = derivative.deriv() * np.polynomial.Polynomial([0.0, -1.0, -1.0])
         slopes.append(x**k * derivative(n))
@@ -140,7 +142,8 @@ def band_average(band: Band, function: Callable[[Floats], Floats]) -> float:
     Intervals wider than 1 % of their frequency are divided, so that smooth spectra are integrated
     to 1e-12.
     """
-    nu, transmission = band.frequency, band.transmission
+    nu = band.frequency
+    transmission = band.transmission
     pieces = np.maximum(np.ceil(np.diff(nu) / (0.01 * nu[:-1])), 1).astype(int)
     inner = [a + h * np.arange(n) / n for a, h, n in zip(nu[:-1], np.diff(nu), pieces, strict=True)]
     edges = np.append(np.concatenate(inner), nu[-1])

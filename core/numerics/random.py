@@ -59,9 +59,11 @@ def stream_key(seed: int, *names: str | int) -> Key:
     digest = hashlib.blake2b(digest_size=8)
     for part in (int(seed), *names):
         if isinstance(part, str):
-            tag, body = b"s", part.encode()
+            tag = b"s"
+            body = part.encode()
         elif isinstance(part, (int, np.integer)) and not isinstance(part, bool):
-            tag, body = b"i", str(int(part)).encode()
+            tag = b"i"
+            body = str(int(part)).encode()
         else:
             raise TypeError(f"a stream is named by str and int, not {part!r}")
         digest.update(tag + len(body).to_bytes(8, "little") + body)

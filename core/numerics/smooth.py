@@ -92,7 +92,8 @@ def _inside(samples: int, dtype: str) -> AnyFloats:
 
 def _limits(samples: slice, n: int) -> tuple[int, int]:
     """Start and stop of a block. Raises ValueError where they are not within 0 and ``n``."""
-    start, stop = samples.start, samples.stop
+    start = samples.start
+    stop = samples.stop
     if not 0 <= start <= stop <= n:
         raise ValueError(f"samples {start}:{stop} outside 0:{n}")
     return start, stop
@@ -196,7 +197,8 @@ class SmoothField:
         """The same field at a shorter ``step``, by halving: b_2k = (c_k + c_k+1) / 2, b_2k-1 =
         (c_k-1 + 6 c_k + c_k+1) / 8.
         """
-        now, c = self.step, np.asarray(self.coefficients, np.float64)
+        now = self.step
+        c = np.asarray(self.coefficients, np.float64)
         while now > step:
             now //= 2
             finer = np.empty((len(c), 2 * c.shape[1] - 3))
@@ -234,7 +236,8 @@ class SmoothField:
             _lines(self.weights, self.coefficients, 0, lines)
             self._kept[kind] = lines
             return Series(lines[detectors], 0, _inside(self.step, kind))
-        weights, first = self.weights[detectors], start // self.step
+        weights = self.weights[detectors]
+        first = start // self.step
         lines = np.empty((len(weights), -(-stop // self.step) - first + 3), dtype)
         _lines(weights, self.coefficients, first, lines)
         return Series(lines, first, _inside(self.step, kind))

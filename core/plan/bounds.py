@@ -458,7 +458,8 @@ class Context:
         """
         if self.coverage is None:
             return 0.0
-        o, cover = self.first, self.coverage
+        o = self.first
+        cover = self.coverage
         passage = o.sample_rate * cover.pixel / max(cover.speed, 1e-12)
         share = cover.hits / max(self.samples, 1)  # of all samples that fall in one pixel
         if common:
@@ -528,7 +529,8 @@ def calibration(observation: Observation) -> float:
 
 def _calibrated_mean(o: Observation) -> float:
     """Largest mean emission of a scan behind the calibration, K; 0: there is none."""
-    emission, transmission = o.smooth.get("atmosphere"), o.smooth.get("transmission")
+    emission = o.smooth.get("atmosphere")
+    transmission = o.smooth.get("transmission")
     if emission is None:
         return 0.0
     share = o.focalplane.illumination_efficiency / o.focalplane.main_beam_efficiency

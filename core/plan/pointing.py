@@ -44,13 +44,15 @@ def samples_of(pipeline: Pipeline, scene: Scene) -> int:
     """Detectors x samples x bands of a scene, without pointing all of it: the scans that
     `Operator.check` looks at stand for the others.
     """
-    data, total = Data(scene=scene), 0.0
+    data = Data(scene=scene)
+    total = 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the run warns
         for operator in pipeline.operators:
             if "boresight" not in operator.provides:
                 continue
-            before, first = data.n_scans, len(data.observations)
+            before = data.n_scans
+            first = len(data.observations)
             operator.check(data)
             if len(data.observations) == first:
                 operator.observe(data)
@@ -76,7 +78,8 @@ def observed(
         data.hand_out()
         for scan, whole in zip(data.bands[band].observations, data.observations, strict=True):
             scan.log.update(whole.log)
-        data, operators = data.bands[band], [o for o in operators if of_one_band(o)]
+        data = data.bands[band]
+        operators = [o for o in operators if of_one_band(o)]
     for operator in operators:
         operator.observe(data)
     return data
@@ -134,7 +137,8 @@ def _some(observations: Sequence[Observation]) -> list[Observation]:
 def _depth(observations: Sequence[Observation], context: Context) -> Depth:
     """See `Depth`. The quietest detector of all scans is noted in the traits."""
     makers = [o for o in context.operators if context.traits[o.label].noise > 0]
-    variances, numbers = [], []
+    variances = []
+    numbers = []
     quietest = dict.fromkeys((o.label for o in makers), math.inf)
     for observation in observations:
         total = np.zeros(observation.n_detectors)
@@ -146,7 +150,8 @@ def _depth(observations: Sequence[Observation], context: Context) -> Depth:
         numbers.append(np.where(observation.good_detectors, float(observation.n_samples), 0.0))
     for label, level in quietest.items():
         context.traits[label] = replace(context.traits[label], noise=level)
-    variance, number = np.concatenate(variances), np.concatenate(numbers)
+    variance = np.concatenate(variances)
+    number = np.concatenate(numbers)
     used = number > 0
     if not makers or not used.any():
         return Depth(0.0, 0.0)
@@ -181,13 +186,16 @@ def cover(observations: Sequence[Observation], pixel: float) -> Coverage:
     """
     most = POINTS * DETECTORS
     exact = sum(o.n_samples * o.n_detectors for o in observations) <= most
-    instants, detectors = max(POINTS // len(observations), 64), DETECTORS
+    instants = max(POINTS // len(observations), 64)
+    detectors = DETECTORS
     if exact:
         instants = detectors = most
     centre = rotation_matrices(observations[0].boresight_radec[:1])[0]
-    points, seen = [], []
+    points = []
+    seen = []
     for o in observations:
-        times, rows = evenly(o.n_samples, instants), evenly(o.n_detectors, detectors)
+        times = evenly(o.n_samples, instants)
+        rows = evenly(o.n_detectors, detectors)
         plane = np.array([-o.focalplane.eta[rows], -o.focalplane.xi[rows], np.ones(len(rows))])
         x, y, z = np.moveaxis(centre.T @ rotation_matrices(o.boresight_radec[times]) @ plane, 1, 0)
         scale = np.maximum(z, 0.1)
@@ -233,7 +241,8 @@ def _hits(where: Floats, pixel: float, weight: Floats, looked: Floats, whole: Fl
     side = np.maximum(extent / cells, 1e-15)
     index = ((where - where.min(axis=1, keepdims=True)) / side[:, None]).astype(np.int64)
     index = np.minimum(index, cells[:, None] - 1)
-    cell, pixels = index[0] * cells[1] + index[1], _numbers(where, pixel)
+    cell = index[0] * cells[1] + index[1]
+    pixels = _numbers(where, pixel)
     _, first = np.unique(cell * (pixels.max() + 1) + pixels, return_index=True)
     u = np.bincount(cell[first]).astype(np.float64)
     seen, every = (np.maximum(np.bincount(cell, n), np.minimum(u, 1.0)) for n in (looked, whole))

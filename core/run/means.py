@@ -154,7 +154,8 @@ class MeansOfBands:
         shape = detectors.stop - detectors.start, samples.stop - samples.start
         found = np.zeros(shape)
         for mean, rows in self._fields:
-            first, stop = max(rows.start, detectors.start), min(rows.stop, detectors.stop)
+            first = max(rows.start, detectors.start)
+            stop = min(rows.stop, detectors.stop)
             if mean is not None and first < stop:
                 own = slice(first - rows.start, stop - rows.start)
                 into = slice(first - detectors.start, stop - detectors.start)
@@ -181,7 +182,9 @@ class WholeStream(Stream):
     ) -> None:
         vars(self).update((name, v) for name, v in vars(stream).items() if name != "array")
         self.means = {name: other for name, other in stream.means.items() if name != stream.name}
-        self._stream, self._field, self._allocate = stream, field, allocate
+        self._stream = stream
+        self._field = field
+        self._allocate = allocate
 
     @cached_property
     def array(self) -> AnyFloats:  # type: ignore[override]

@@ -106,11 +106,14 @@ def reading(place: str, kind: str, cure: str) -> Iterator[None]:
     except Exception as error:
         message = f"cannot be read as {kind}: {first_line(error)}"
         if isinstance(error, FileNotFoundError):
-            message, cure = "there is no such file", _whereabouts(error.filename)
+            message = "there is no such file"
+            cure = _whereabouts(error.filename)
         elif isinstance(error, IsADirectoryError):
-            message, cure = "is a folder, not a file", "give the file's path"
+            message = "is a folder, not a file"
+            cure = "give the file's path"
         elif isinstance(error, PermissionError):
-            message, cure = "permission denied", "make the file readable"
+            message = "permission denied"
+            cure = "make the file readable"
         elif isinstance(error, KeyError):
             message = f"is incomplete or corrupt: {error.args[0] if error.args else ''}"
         elif isinstance(error, MemoryError):

@@ -26,7 +26,8 @@ every claimed one.
 """
 HEADER_MAX = 10_000_000
 """Bytes of one header: 125 000 cards."""
-BLOCK, CARD = 2880, 80
+BLOCK = 2880
+CARD = 80
 COMMENTARY = {"", "COMMENT", "HISTORY"}
 """Keys of cards without a value."""
 PIECE = 1 << 20
@@ -140,7 +141,8 @@ def check_size(hdu: Any, place: str, *, whole: bool = True) -> None:
     info = hdu.fileinfo()
     if info is None or tiled:
         return
-    needed, found = info["datLoc"] + size, info["file"].size
+    needed = info["datLoc"] + size
+    found = info["file"].size
     if found < needed:
         raise OSError(
             f"the file is truncated: {found} bytes, its header promises at least {needed}"

@@ -142,7 +142,10 @@ class Table:
         meta: Mapping[str, Any] | None = None,
         counted: str = "line",
     ) -> None:
-        self.place, self.columns, self.lines, self.meta = place, columns, lines, meta or {}
+        self.place = place
+        self.columns = columns
+        self.lines = lines
+        self.meta = meta or {}
         self.counted = counted
         self._mistakes: list[tuple[int, str, str]] = []
 
@@ -165,7 +168,8 @@ class Table:
 
     def check(self) -> None:
         """Raise `InputError` about all mistakes at once, each with its line."""
-        found, self._mistakes = sorted(self._mistakes, key=lambda mistake: mistake[0]), []
+        found = sorted(self._mistakes, key=lambda mistake: mistake[0])
+        self._mistakes = []
         told = [
             (f"{self.counted} {line}: {text}" if line else text, cure) for line, text, cure in found
         ]
@@ -201,7 +205,8 @@ class Table:
         texts = self.texts(name)
         if name not in self.columns:
             return np.full(len(self), np.nan)
-        factor, values = self.factor(name, unit), self.values(name)
+        factor = self.factor(name, unit)
+        values = self.values(name)
         blank = np.zeros(len(self), bool)
         if empty is not None:
             blank = np.array([text.strip().lower() in EMPTY for text in texts], bool)
@@ -256,7 +261,8 @@ class Table:
             if plain not in known and last in known:
                 plain = last
             elif plain not in known and base in known and after in WRITTEN and not unit:
-                plain, stated = base, WRITTEN[after]
+                plain = base
+                stated = WRITTEN[after]
             if plain not in written or name == plain:
                 written[plain] = name, stated
         found = {
@@ -393,7 +399,8 @@ def _kind(text: str, body: Lines) -> str:
 
 def _check_names(names: Sequence[str], table: Table) -> None:
     """Refuse too many columns, and names that are too long; note those that are there twice."""
-    text, cure = "", "leave out columns"
+    text = ""
+    cure = "leave out columns"
     if len(names) > MOST_COLUMNS:
         text = f"has {len(names)} columns, more than the {MOST_COLUMNS} that are read"
     elif long := [name for name in names if len(name) > LONGEST_NAME]:
@@ -459,7 +466,8 @@ def _votable(text: str) -> Parsed:
     """The first table of a VOTable: names and units of its fields, and TABLEDATA."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it declares entities")
-    named, rows = Named(), [list[str]()]
+    named = Named()
+    rows = [list[str]()]
     for element in ElementTree.fromstring(text).iter():
         kind = element.tag.rpartition("}")[2]
         if kind == "STREAM":
@@ -504,7 +512,8 @@ def _plain_text(written: Lines, body: Lines, names: Sequence[str] | None) -> Par
     first = body[0][1] if body else ""
     mark = max(",;\t|", key=first.count)
     if mark not in first or (mark == "\t" and all(map(_is_number, first.split()))):
-        mark, body = " ", [(number, line.replace("\t", " ")) for number, line in body]
+        mark = " "
+        body = [(number, line.replace("\t", " ")) for number, line in body]
     numbers, rows = _cells(body, mark)
     units: list[str] = []
     for k in range(1, min(4, len(rows))):
@@ -520,7 +529,8 @@ def _plain_text(written: Lines, body: Lines, names: Sequence[str] | None) -> Par
         if not fitting and names and len(names) >= len(rows[0]):
             fitting = [(body[0][0], list(names[: len(rows[0])]))]
         for number, heading in fitting[-1:]:
-            numbers, rows = [number, *numbers], [heading, *rows]
+            numbers = [number, *numbers]
+            rows = [heading, *rows]
     heading = rows[0] if rows else []
     found = [BRACKETED.fullmatch(word) if len(word) <= LONGEST_NAME else None for word in heading]
     named = [

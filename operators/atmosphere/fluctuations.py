@@ -83,7 +83,8 @@ class AtNodes:
         n_samples: int,
     ) -> AtNodes:
         """Evaluate the layers at the nodes over the whole scan, a part of it at a time."""
-        n_node, weights = len(nodes.xi), np.ascontiguousarray(nodes.weights)
+        n_node = len(nodes.xi)
+        weights = np.ascontiguousarray(nodes.weights)
         width = -(-n_samples // step) + 3
         coefficients = {name: np.empty((n_node, width)) for name in response.names}
         sums = []
@@ -127,15 +128,22 @@ class OfDetectors:
         step: int,
         n_samples: int,
     ) -> None:
-        self._xi, self._eta, self._layers = nodes.xi, nodes.eta, layers
-        self._to_pwv, self._response = to_pwv, response
-        self.step, self._n_samples = step, n_samples
+        self._xi = nodes.xi
+        self._eta = nodes.eta
+        self._layers = layers
+        self._to_pwv = to_pwv
+        self._response = response
+        self.step = step
+        self._n_samples = n_samples
         self._units: OrderedDict[tuple[int, int], Future[dict[str, AnyFloats]]] = OrderedDict()
         self._sums: dict[tuple[int, int], tuple[int, float, float]] = {}
         self._lock = threading.Lock()
-        n_detectors, streams = len(nodes.xi), len(response.names)
-        self._groups, self._times = -(-n_detectors // UNIT_DETECTORS), -(-n_samples // UNIT_SAMPLES)
-        self._keeps_all, self._begun = keeps_all(n_detectors, n_samples, step, streams), 0
+        n_detectors = len(nodes.xi)
+        streams = len(response.names)
+        self._groups = -(-n_detectors // UNIT_DETECTORS)
+        self._times = -(-n_samples // UNIT_SAMPLES)
+        self._keeps_all = keeps_all(n_detectors, n_samples, step, streams)
+        self._begun = 0
         self._most = max(1, BYTES_KEPT // _unit_size(n_detectors, step, streams))
         if self._keeps_all:
             self._most = self._groups * self._times

@@ -199,7 +199,8 @@ def _emission_per_fluctuation(model: AtmosphereModel, observation: Observation) 
         / y
     )
     transmission = float(model.band.transmission(model.pwv, elevation[0]))
-    plane, good = observation.focalplane, observation.good_detectors
+    plane = observation.focalplane
+    good = observation.good_detectors
     ratio = plane.illumination_efficiency[good] / plane.main_beam_efficiency[good]
     return rise / transmission * math.sqrt(float(np.mean(ratio**2)))
 
@@ -234,14 +235,13 @@ class AtmosphereLayers(LayerParameters):
         """The weather and what the band sees of it. Raises InputError or PointingError where a run
         cannot be seen through it.
         """
-        models, lines = (
-            Models(data.scene.time, data.scene.weather, {}, self._models._bands),
-            list[str](),
-        )
+        models = Models(data.scene.time, data.scene.weather, {}, self._models._bands)
+        lines = list[str]()
         for observation in data.observations:
             _check_pointing(observation)
         for alone in data.observations[0].of_each_band() if data.observations else ():
-            model, band = models.of(self, alone), alone.instrument.band.name
+            model = models.of(self, alone)
+            band = alone.instrument.band.name
             _ = (
                 model.turbulence,
                 model.ground,
@@ -333,7 +333,8 @@ class AtmosphereLayers(LayerParameters):
 
 
 def _check_pointing(observation: Observation) -> None:
-    quaternions, lowest = observation.boresight_azel, 1.0
+    quaternions = observation.boresight_azel
+    lowest = 1.0
     for chunk in chunks(observation.n_samples):
         x, y, *_ = part = quaternions[chunk].T
         if not np.isfinite(part).all():

@@ -103,7 +103,8 @@ def choose_resolution(
     time may err by both shares, sqrt(2) of it. ``variance`` is that of the sum of the layers after
     the beam. The mean emission may be wrong by `MEAN_SHARE` of that.
     """
-    xi, eta = observation.focalplane.xi, observation.focalplane.eta
+    xi = observation.focalplane.xi
+    eta = observation.focalplane.eta
     rms = math.sqrt(variance)
     left = differential_rms(*spread_evenly(xi, eta), layers, plane.stretch)
     # Of the rms of the fluctuation. A single detector, or none apart, is judged as if a hundredth
@@ -194,7 +195,10 @@ class _Timing:
         plane: ScanPlane,
         layers: Sequence[Layer],
     ) -> None:
-        self._path, self._observation, self._plane, self._layers = path, observation, plane, layers
+        self._path = path
+        self._observation = observation
+        self._plane = plane
+        self._layers = layers
         self._speeds = _speeds(path, plane, layers)
         self._tried: dict[int, tuple[list[float], float]] = {}
 
@@ -335,14 +339,16 @@ class _Path:
     def _errors_of(self, step: int) -> tuple[Floats, float]:
         """Rms spline errors of the crossing X (2,) and of the elevation [rad], the worst of the
         three points; from `IN_A_CELL` samples of each cell."""
-        squares, total = np.zeros(9), 0
+        squares = np.zeros(9)
+        total = 0
         each = max(1, step // IN_A_CELL)
         for window in self._windows:
             n = window.stop - window.start
             index = window.start + times_with_margin(n, step)
             u = rays(axes_at(self._observation.boresight_azel, index, step), self._xi, self._eta)
             here = self._rays(slice(window.start, window.stop, each))
-            count, rows = -(-n // each), 3 * len(self._xi)
+            count = -(-n // each)
+            rows = 3 * len(self._xi)
             truth = np.concatenate([crossing(here).reshape(-1, count), np.arcsin(here[2])])
             values = np.concatenate([crossing(u).reshape(-1, len(index)), np.arcsin(u[2])])
             spline = SmoothField.from_values(np.eye(rows), values, step // each, count)

@@ -76,7 +76,8 @@ class LayerScreen:
         from matplotlib.patches import Circle
 
         half = self.values.shape[0] * self.spacing / 2
-        speed, azimuth = math.hypot(*self.wind), math.degrees(math.atan2(*self.wind)) % 360
+        speed = math.hypot(*self.wind)
+        azimuth = math.degrees(math.atan2(*self.wind)) % 360
         wind = f"wind {speed:.3g} m/s towards {azimuth:.0f}°"
         _image(ax, self.values, half, f"{self.height:.0f} m\n{wind}")
         ax.plot(*self.track.T, color="black", linewidth=0.6)
@@ -299,8 +300,10 @@ def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: Integers) -
 
     Samples are rounded down to the times that `AtmosphereLayers` evaluates.
     """
-    step, law = model.resolution().step, model.fluctuation
-    layers, height = drifting_layers(model, (xi, eta)), height_of_vapour(model)
+    step = model.resolution().step
+    law = model.fluctuation
+    layers = drifting_layers(model, (xi, eta))
+    height = height_of_vapour(model)
     found = []
     for sample in samples:
         g, sine = layers(xi, eta, int(sample) // step, 1)
@@ -316,7 +319,8 @@ def pwv_at(model: AtmosphereModel, xi: Floats, eta: Floats, samples: Integers) -
 
 def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
     """Every layer that is simulated about the boresight's place at sample ``at``."""
-    o, plane = model.observation, model.plane
+    o = model.observation
+    plane = model.plane
     step = max(1, o.n_samples // 2000)
     samples = np.append(np.arange(0, o.n_samples, step), at)
     path = LinesOfSight(o, plane, 1, 0, o.n_samples)
@@ -326,13 +330,16 @@ def _layers(model: AtmosphereModel, at: int) -> list[LayerScreen]:
     angle = 2 * float(np.hypot(o.focalplane.xi, o.focalplane.eta).max())
     found = []
     for number in model.simulated:
-        layer, field = model.layers[number], model.turbulence[number]
+        layer = model.layers[number]
+        field = model.turbulence[number]
         matrix, start, velocity = plane.affine(layer.height, layer.wind)
         place = (
             matrix @ crossing + start[:, None] + velocity[:, None] * path.seconds[samples]
         ).T  # across, along
-        here, track = place[-1], place[:-1] - place[-1]
-        fwhm, d = field.sigma * FWHM_PER_SIGMA, field.spacing
+        here = place[-1]
+        track = place[:-1] - place[-1]
+        fwhm = field.sigma * FWHM_PER_SIGMA
+        d = field.spacing
         half = max(
             LEAST_BEAMS / 2 * fwhm,
             layer.distance * angle,
@@ -374,7 +381,8 @@ def write(found: Screens, stem: Path) -> list[Path]:
     """``STEM.fits`` (PWV over the field, then each layer) and ``STEM.ecsv`` (the layers); their
     paths. Raises OutputError.
     """
-    images, table = stem.with_name(f"{stem.name}.fits"), stem.with_name(f"{stem.name}.ecsv")
+    images = stem.with_name(f"{stem.name}.fits")
+    table = stem.with_name(f"{stem.name}.ecsv")
     step = math.degrees(found.side) / (found.pwv.shape[1] - 1)
     with atomic_path(images) as temporary, open(temporary, "wb") as file:
         cards = [

@@ -93,7 +93,8 @@ def neighbours(plane: Focalplane, level: float) -> Any:
     from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
 
-    at, bands = np.stack([plane.xi, plane.eta], axis=1).round(12), np.asarray(plane.band)
+    at = np.stack([plane.xi, plane.eta], axis=1).round(12)
+    bands = np.asarray(plane.band)
     pairs = [np.zeros((0, 2), np.int64)]
     for band in np.unique(bands):
         of_band = np.flatnonzero(bands == band)

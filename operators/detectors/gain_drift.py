@@ -82,7 +82,8 @@ class GainDrift(Operator):
 
 def grid(observation: Observation, fastest: float) -> tuple[int, int, int]:
     """(samples between nodes, nodes of the period P, number of waves) for a scan."""
-    rate, n = observation.sample_rate, observation.n_samples
+    rate = observation.sample_rate
+    n = observation.n_samples
     step = min(max(rate / (NODES * fastest), 1.0), TILE_SAMPLES)
     step = 1 << int(math.log2(step))
     nodes = max(2 * -(-n // step), NODES)
@@ -99,7 +100,8 @@ def drifts(
     and nodes of `grid`.
     """
     (step, nodes), n_det = layout, observation.n_detectors
-    key, waves = observation.detector_key(label), len(amplitude)
+    key = observation.detector_key(label)
+    waves = len(amplitude)
     wanted = -(-observation.n_samples // step) + 3
     at = np.arange(-1, wanted - 1) % nodes
     coefficients = np.empty((n_det, wanted))

@@ -55,7 +55,8 @@ class Glitches(Operator):
 
     def prepare(self, observation: Observation) -> Pulses:
         """Draw the pulses of all detectors from `REACH` decay times before the scan to its end."""
-        begin, end = -REACH * self.decay, float(observation.seconds[-1])
+        begin = -REACH * self.decay
+        end = float(observation.seconds[-1])
         found = []
         for d in range(observation.n_detectors):
             when, u = self._of_detector(observation, d, end - begin)
@@ -66,7 +67,8 @@ class Glitches(Operator):
 
     def exec(self, block: Block, state: Pulses) -> None:
         """Add the pulses of the block's detectors."""
-        stream, observation = block.new("glitches"), block.observation
+        stream = block.new("glitches")
+        observation = block.observation
         threshold = math.inf if self.flag_above is None else self.flag_above
         lost = 0
         for row, (times, sizes) in zip(stream, state[block.detectors], strict=True):
@@ -93,7 +95,8 @@ class Glitches(Operator):
         """
         if self.rate == 0:
             return np.zeros(0), np.zeros(0)
-        key, mean = observation.detector_key(self.label), self.rate * span
+        key = observation.detector_key(self.label)
+        mean = self.rate * span
         number = int(mean + 6 * math.sqrt(mean) + 16)
         while True:
             u = uniforms(key, 0, 2 * number, stream=detector).reshape(

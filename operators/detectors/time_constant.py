@@ -79,7 +79,8 @@ class TimeConstant(Operator):
         """(n_det, 2 + 2 TAPS): a of equation (2), the samples that each remembers (0: it does
         nothing), and w.
         """
-        tau, rate = self.constants(observation), observation.sample_rate
+        tau = self.constants(observation)
+        rate = observation.sample_rate
         cut = 1 / (2 * np.pi * max(float(np.median(tau)), 1e-12))
         if cut < 1e9:
             text = (

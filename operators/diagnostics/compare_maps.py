@@ -178,7 +178,8 @@ class CompareMaps(Output):
         """The planes of the reference, K_RJ."""
         if self.file is None:
             return planes_of(_product(data, self.reference, self.label), self.reference)
-        read, band = self._read(), data.scene.instrument.band
+        read = self._read()
+        band = data.scene.instrument.band
         for what, _, note in (note.partition(": ") for note in read.notes):
             data.log.state(self.label, what, note)
         return {which: _in_kelvin(plane, band) for which, plane in read.planes.items()}
@@ -255,7 +256,8 @@ def _tell(label: str, of: str, data: Data, found: Comparison) -> None:
         ("rms of the difference", f"{f['rms difference']:.3e} {found.unit}"),
     ]
     if f.get("chi2 values"):
-        ratio, error = f["chi2"] / f["chi2 pixels"], math.sqrt(2 / f["chi2 values"])
+        ratio = f["chi2"] / f["chi2 pixels"]
+        error = math.sqrt(2 / f["chi2 values"])
         told.append(("chi2 of the difference / pixels", f"{ratio:.4g} +- {error:.2g}"))
     for what, text in told:
         data.log.state(label, of + what, text)

@@ -180,7 +180,8 @@ def values_of(found: Pair, step: float, segments: float) -> tuple[Floats, Floats
     x, y, cross = (float(p.sum()) for p in (found.power, found.reference, found.cross.real))
     if not (x > 0 and y > 0):
         return values, errors
-    gain, r = cross / y, max(-1.0, min(1.0, cross / math.sqrt(x * y)))
+    gain = cross / y
+    r = max(-1.0, min(1.0, cross / math.sqrt(x * y)))
     rest = found.rest(gain)
     shared = SHARED / segments  # df' / df / n, of sums without df
 
@@ -242,7 +243,8 @@ class StreamComparison(Series):
         names: list[str],
     ) -> StreamComparison:
         """Comparison of one scan, from the spectra of each detector."""
-        f, segments = welch.frequency, welch.independent
+        f = welch.frequency
+        segments = welch.independent
         found = np.array([values_of(p, float(f[0]), segments) for p in pairs])
         power = np.mean([(p.power, p.reference, p.rest(1.0)) for p in pairs], axis=0)
         if unit_of_stream(step.stream) != unit_of_stream(step.reference):
@@ -258,7 +260,8 @@ class StreamComparison(Series):
     def __iadd__(self, other: Self) -> Self:
         """The mean of all scans, each with the same weight."""
         if self.alike(other):
-            n, m = self.observations, other.observations
+            n = self.observations
+            m = other.observations
             self.errors = np.hypot(self.errors * n, other.errors * m) / (n + m)
         return super().__iadd__(other)
 

@@ -97,8 +97,10 @@ def sphere_spectra(
         / second
     )
     lowest = max(2.0, math.pi / math.sqrt(4 * math.pi * np.count_nonzero(window) / number))
-    edges, multipole = np.geomspace(lowest, largest, bins + 1), np.arange(largest + 1)
-    ring, weight = np.digitize(multipole, edges) - 1, 2.0 * multipole + 1
+    edges = np.geomspace(lowest, largest, bins + 1)
+    multipole = np.arange(largest + 1)
+    ring = np.digitize(multipole, edges) - 1
+    weight = 2.0 * multipole + 1
     ring[(ring < 0) | (ring >= bins)] = bins
     count = np.bincount(ring, weight, bins + 1)[:bins]
 
@@ -131,10 +133,8 @@ def _windowed(plane: MapProduct, window: Floats, mean: bool) -> Floats:
     """
     import healpy
 
-    whole, values = (
-        np.zeros(healpy.nside2npix(plane.nside)),
-        np.where(window > 0, plane.signal, 0.0),
-    )
+    whole = np.zeros(healpy.nside2npix(plane.nside))
+    values = np.where(window > 0, plane.signal, 0.0)
     whole[plane.pixels] = window * (values - (window * values).sum() / window.sum() * mean)
     return np.asarray(healpy.reorder(whole, n2r=True) if plane.nest else whole)
 
@@ -162,10 +162,8 @@ def _white(
 USABLE = frozenset({"TAN", "HEALPix"})
 """Kinds of maps of which there is a spectrum."""
 SEVERAL_HEALPIX = "spectra of HEALPix maps are of one map at a time"
-NO_MAP, CURE = (
-    "there is no TAN or HEALPix map of the signal",
-    "leave projection and contents of the map out",
-)
+NO_MAP = "there is no TAN or HEALPix map of the signal"
+CURE = "leave projection and contents of the map out"
 
 HALVES = {"": "", "_E": " (E)", "_B": " (B)"}
 """How the spectra of the half-difference are called."""

@@ -72,7 +72,8 @@ class MeasureFigures(Output):
 
     def finalize(self, data: Data) -> None:
         """Measure, in the order of the list."""
-        names, found = list(self.shown), []
+        names = list(self.shown)
+        found = []
         for choice in self.metrics:
             count = len(choice.metric.needs()) if isinstance(choice.metric, FigureMetric) else 0
             found.append(_figure(choice, data, names[:count]))

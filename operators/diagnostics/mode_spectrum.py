@@ -70,11 +70,12 @@ class Lagged:
     """
 
     def __init__(self, stream: Stream, detectors: Integers, delays: int, lag: int) -> None:
-        self.stream, self.detectors, self.delays, self.lag = stream, detectors, delays, lag
-        self.n_rows, self.n_samples = (
-            detectors.size * (delays + 1),
-            max(0, stream.shape[1] - delays * lag),
-        )
+        self.stream = stream
+        self.detectors = detectors
+        self.delays = delays
+        self.lag = lag
+        self.n_rows = detectors.size * (delays + 1)
+        self.n_samples = max(0, stream.shape[1] - delays * lag)
         good = stream.observation.good_samples
         self.good = np.ones(self.n_samples, bool)
         for k in range(delays + 1):
@@ -106,7 +107,8 @@ class Lagged:
 
     def _columns(self, samples: slice) -> Floats:
         """(n_det, n) of the stream, its mean included, without its first good sample; float64."""
-        array, mean = self.stream.array, self.stream.means.get(self.stream.name)
+        array = self.stream.array
+        mean = self.stream.means.get(self.stream.name)
         x = np.asarray(array[:, samples][self.detectors], np.float64)
         forget_pages(array)
         if mean is not None:
@@ -125,7 +127,8 @@ def components(
     """Equation (2). ``center``: subtract the rows' means; ``normalize``: divide rows by their rms,
     so that each counts alike.
     """
-    c, total = np.zeros((lagged.n_rows, lagged.n_rows)), np.zeros(lagged.n_rows)
+    c = np.zeros((lagged.n_rows, lagged.n_rows))
+    total = np.zeros(lagged.n_rows)
     for _, rows in lagged.tiles():
         c += rows @ rows.T
         total += rows.sum(axis=1)
@@ -146,7 +149,8 @@ def components(
         scale = np.where(rms > 0, 1 / np.where(rms > 0, rms, 1.0), 0.0)
         c *= np.outer(scale, scale)
     squares, vectors = np.linalg.eigh((c + c.T) / 2)
-    squares, u = np.maximum(squares[::-1], 0.0), vectors.T[::-1][:modes]
+    squares = np.maximum(squares[::-1], 0.0)
+    u = vectors.T[::-1][:modes]
     u *= np.sign(u[np.arange(len(u)), np.argmax(abs(u), axis=1)])[:, None]
     times = np.full((len(u), lagged.stream.shape[1]), np.nan)
     weights = u * scale * used
@@ -212,7 +216,8 @@ class ModeSpectrum(StreamDiagnostic):
 
     def measure(self, stream: Stream, model: Any = None) -> Any:
         """Read the stream twice: for the covariance, and for the streams of the modes."""
-        observation, log = stream.observation, stream.observation.log
+        observation = stream.observation
+        log = stream.observation.log
         chosen = spread_evenly(observation, self.detectors)
         lag = max(1, round(self.delay * observation.sample_rate))
         lagged = Lagged(stream, chosen, self.delays, lag)

@@ -99,7 +99,8 @@ class Flat:
             seen = smoother(product.grid, product.smoothed_by)(seen)
         found: dict[str, Any] = {**planes, "hits": product.known_hits, "seen": seen}
         found, wcs = on_plane(product, found)
-        hits, seen = found.pop("hits"), np.nan_to_num(found.pop("seen"))
+        hits = found.pop("hits")
+        seen = np.nan_to_num(found.pop("seen"))
         used = seen[hits > 0]
         enough = seen >= least * np.percentile(used, 99) if used.size else seen > 0
         return cls(found, hits, enough, wcs)
@@ -108,13 +109,15 @@ class Flat:
         """Rows and columns where there are samples, with a margin of a hundredth of the longer
         side; all, if they are most.
         """
-        seen, size = self.hits > 0, np.array(self.hits.shape)
+        seen = self.hits > 0
+        size = np.array(self.hits.shape)
         if not seen.any():
             return slice(None), slice(None)
         places = np.nonzero(seen)
         low, high = (np.array([f(n) for n in places]) for f in (np.min, np.max))
         spare = math.ceil(0.01 * (high + 1 - low).max())
-        low, high = np.maximum(low - spare, 0), np.minimum(high + 1 + spare, size)
+        low = np.maximum(low - spare, 0)
+        high = np.minimum(high + 1 + spare, size)
         if (high - low).prod() >= 0.9 * size.prod():
             return slice(None), slice(None)
         return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
@@ -139,13 +142,16 @@ class Flat:
 def draw_input(file: str, image: Image, signed: bool = False) -> list[Sketch]:
     """Input map (ny, nx), K_RJ; ``signed``: Q or U, with zero in the middle of the colours."""
     step = -(-max(image.values.shape) // LARGEST)
-    values, wcs = image.values[::step, ::step], wcs_of(image.header)[::step, ::step]
+    values = image.values[::step, ::step]
+    wcs = wcs_of(image.header)[::step, ::step]
     what = _named("Input", file, "input")
-    ax, title = map_axes(values.shape, wcs)[0], f"{what}: the sky before the beam"
+    ax = map_axes(values.shape, wcs)[0]
+    title = f"{what}: the sky before the beam"
     if signed:
         top = float(np.nanpercentile(np.abs(values), 99.7)) or 1.0
         factor, unit = unit_of(top)
-        limits, label = (-top * factor, top * factor), f"Rayleigh–Jeans brightness [{unit}]"
+        limits = (-top * factor, top * factor)
+        label = f"Rayleigh–Jeans brightness [{unit}]"
         plot_plain(values * factor, wcs, limits, "RdBu_r", label, ax=ax, title=title)
     else:
         plot_map(values, wcs, ax=ax, title=title)
@@ -180,7 +186,8 @@ def draw_map(
     }
     other = f"Map of signal {signal}", "The signal of this name in `runs`."
     title, meaning = titles.get(signal, other)
-    title, how = _named(title, key), _how(product, shown)
+    title = _named(title, key)
+    how = _how(product, shown)
     text = f"{meaning} {how[0].upper()}{how[1:]}"
     if product.taken_off:
         text += f" Its {product.taken_off} is taken off: the data hardly determine it."
@@ -206,7 +213,10 @@ def draw_noise(
     comes first, and ``source_free``.
     """
     panels: list[tuple[Flat, AnyFloats, str]] = []
-    values, limits, how, window = [], [], "", None
+    values = []
+    limits = []
+    how = ""
+    window = None
     first = next(iter(sources.values()))[0]
     diameter = central_diameter(first.fwhm, first.pixel, style.central_diameter)
     for of, (product, plane) in sources.items():
@@ -248,7 +258,8 @@ def draw_coverage(file: str, product: MapProduct) -> list[Sketch]:
     what = "Samples per pixel" if per_beam is None else "Integration time per beam"
     title = _named(what, file, "coverage")
     ax = plot_coverage(flat.hits, flat.wcs, per_beam=per_beam, title=title)
-    samples, pixels = int(product.hits.sum()), int((product.hits > 0).sum())
+    samples = int(product.hits.sum())
+    pixels = int((product.hits > 0).sum())
     text = f"{samples:,} samples in {pixels:,} pixels of {sides_text(*product.sides)}.".replace(
         ",",
         "\u202f",
@@ -281,8 +292,10 @@ def draw_plane(file: str, product: MapProduct, name: str) -> list[Sketch]:
 
 def _how(product: MapProduct, shown: MapProduct) -> str:
     """Smoothing of a map for its picture, and the meaning of the circle in its corner, in words."""
-    beam, smoothing = angle_text(shown.fwhm), angle_text(shown.smoothed_by)
-    text, circle = "not smoothed", f" Resolution {beam} FWHM, the beam's."
+    beam = angle_text(shown.fwhm)
+    smoothing = angle_text(shown.smoothed_by)
+    text = "not smoothed"
+    circle = f" Resolution {beam} FWHM, the beam's."
     if shown.smoothed_by:
         text = f"smoothed by {smoothing}{'' if product.smoothed_by else ' for this picture'}"
         both = f"the beam's {beam} and the smoothing's {smoothing}, added in quadrature"
@@ -408,7 +421,8 @@ class Plots(MapOutput):
     def look(self, unit: str) -> Look:
         """Colours of maps in ``unit``. Raises InputError for limits in another."""
         plain, size = parse_unit(unit or "K_RJ", place=self.label, temperature_scale="K_RJ")
-        scale, ends = plain if plain.startswith("K_") else "K_RJ", []
+        scale = plain if plain.startswith("K_") else "K_RJ"
+        ends = []
         for text in self.limits or ():
             number, _, of = text.strip().partition(" ")
             other, factor = parse_unit(of, place=self.label, temperature_scale=scale)
@@ -500,7 +514,8 @@ def _of_series(data: Data, style: Plots) -> Iterator[Sketch]:
     before = _steps_before(data)
     bands = [f"_{band.name}" for band in data.scene.instrument.bands]
     for name, product in data.products.items():
-        file, label = _file(name), getattr(product, "label", "")
+        file = _file(name)
+        label = getattr(product, "label", "")
         band = next((b for b in bands if name.endswith(b)), "")
         if stem := FILES.get(type(product)):
             file = f"{stem}{band if name == f'{product.usual}{band}' else f'_{file}'}"
@@ -517,7 +532,8 @@ def _file(name: str) -> str:
 
 def _steps_before(data: Data) -> dict[str, str]:
     """The last step above each step that may have changed the streams, by label."""
-    found, last = {}, ""
+    found = {}
+    last = ""
     for label, kind, _ in data.provenance.get("operators", []):
         found[label] = last
         if kind not in (

@@ -46,7 +46,9 @@ class Welch:
     def __init__(self, n: int, sample_rate: float, length: int) -> None:
         turn = 2 * np.pi * np.arange(length) / length
         w = 0.5 - 0.5 * np.cos(turn) if length > 2 else np.ones(length)
-        self._length, self._step, self._window = length, max(1, length // 2), w
+        self._length = length
+        self._step = max(1, length // 2)
+        self._window = w
         segments = (n - length) // self._step + 1
         self._line = np.arange(length) - (length - 1) / 2
         self._slope = self._line / (self._line**2).sum()
@@ -173,7 +175,8 @@ class PowerSpectrum(StreamDiagnostic):
             observation.log.count(self.label, f"scans {why} a power spectrum", 1)
             return
         psd = {name: np.mean([row[name] for row in rows if name in row], axis=0) for name in names}
-        net, f = observation.focalplane.net[every], state.welch.frequency
+        net = observation.focalplane.net[every]
+        f = state.welch.frequency
         forms = {
             name: np.sum([law(f) for law in observation.closed_forms[name]], axis=0)
             for name in names

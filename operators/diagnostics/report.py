@@ -79,7 +79,8 @@ class Report(Output):
 
 def page(data: Data, shown: Sequence[Picture], central_diameter: float | None) -> str:
     """The whole page. All text is escaped by the template."""
-    provenance, scene = data.provenance, data.scene
+    provenance = data.provenance
+    scene = data.scene
     version = str(provenance.get("versions", {}).get("zonda", ""))
     return render(
         __package__,
@@ -119,8 +120,11 @@ def _pictures(shown: Sequence[Picture], bands: Sequence[str]) -> list[dict[str, 
 def _scene(data: Data) -> dict[str, Any]:
     """Text about the scene by name; what is empty is not shown."""
     scene = data.scene
-    instrument, site, telescope = scene.instrument, scene.site, scene.instrument.telescope
-    cameras, target = instrument.cameras, scene.target
+    instrument = scene.instrument
+    site = scene.site
+    telescope = scene.instrument.telescope
+    cameras = instrument.cameras
+    target = scene.target
     number = " + ".join(str(camera.detectors) for camera in cameras.values())
     place = f"{np.degrees(site.latitude):.4f}°, {np.degrees(site.longitude):.4f}°"
     field = f"detectors in a field of {angle_text(instrument.field_of_view)}"
@@ -248,7 +252,8 @@ def scaled(value: float, unit: str, least: float = 1.0) -> str:
 
 def spread(values: Any, unit: str = "") -> str:
     """One number where all are the same, else the range and the mean."""
-    low, high = float(np.min(values)), float(np.max(values))
+    low = float(np.min(values))
+    high = float(np.max(values))
     if math.isclose(low, high, rel_tol=1e-9):
         return f"{low:.4g}{unit}"
     return f"{low:.4g} to {high:.4g}{unit}, mean {float(np.mean(values)):.4g}"
@@ -282,7 +287,8 @@ def readable(text: str) -> str:
     match = _NUMBER.fullmatch(text.strip())
     if match is None or match[2].strip() not in _UNITS:
         return text
-    value, unit = float(match[1]), match[2].strip()
+    value = float(match[1])
+    unit = match[2].strip()
     if value == 0:
         return f"0 {unit.replace(' / ', '/')}"
     fitting = [(f, n) for f, n in _UNITS[unit] if abs(value) * f >= 0.9999995] or _UNITS[unit][-1:]
@@ -313,7 +319,8 @@ def results(data: Data, given: float | None) -> tuple[dict[str, str], list[Row]]
     ``given`` is the diameter [rad] of the circle in which that is taken; None stands for
     `central_diameter` of each map.
     """
-    maps, whole = maps_of(data.products), maps_of(data.products, split=False)
+    maps = maps_of(data.products)
+    whole = maps_of(data.products, split=False)
     wide = {name: central_diameter(m.fwhm, m.pixel, given) for name, m in maps.items()}
     main = {name: product for name, product in maps.items() if "/" not in name}
     seconds = sum(o.duration for o in data.scans)
@@ -353,7 +360,8 @@ def _unsolved(name: str, product: MapProduct) -> dict[str, str]:
     """Number of pixels with samples in which a map has no I, Q and U; none where there are all."""
     if product.polarization is None:
         return {}
-    hit, solved = int(np.count_nonzero(product.hits)), int(np.count_nonzero(product.known))
+    hit = int(np.count_nonzero(product.hits))
+    solved = int(np.count_nonzero(product.known))
     label = _of(name)
     text = f"pixels with samples are NaN: too few angles of polarization for I, Q and U{label}"
     return {text: f"{hit - solved} of {hit}"} if solved < hit else {}
@@ -392,7 +400,8 @@ def expected(name: str, product: MapProduct, diameter: float) -> list[Row]:
     A: the weight of the pixels 1 / noise^2 is added up per solid angle.
     """
     near = product.distance() <= diameter / 2
-    noise, areas = product.noise[near], np.broadcast_to(product.areas(), product.hits.shape)[near]
+    noise = product.noise[near]
+    areas = np.broadcast_to(product.areas(), product.hits.shape)[near]
     known = np.isfinite(noise) & (noise > 0)
     if not known.any() or product.noise_from != "net" or product.contents != "all":
         return []
@@ -421,7 +430,8 @@ def _depth(name: str, product: MapProduct, diameter: float) -> list[Row]:
     """The time for which the centre of a map was observed, the median over its pixels; none
     if it is not known.
     """
-    factor, near = product.seconds_per_beam(), product.distance() <= diameter / 2
+    factor = product.seconds_per_beam()
+    near = product.distance() <= diameter / 2
     if factor is None or not near.any():
         return []
     samples = product.hits[near]

@@ -97,10 +97,12 @@ class Series(Record):
         if not self.alike(other):
             self.of_another_length += other.observations
             return self
-        n, m = self.observations, other.observations
+        n = self.observations
+        m = other.observations
         self.observations = n + m
         for name in self.means:
-            own, more = getattr(self, name), getattr(other, name)
+            own = getattr(self, name)
+            more = getattr(other, name)
             if isinstance(own, dict):
                 mean: Any = {k: (own[k] * n + more[k] * m) / (n + m) for k in own if k in more}
             else:
@@ -159,14 +161,16 @@ class Spectrum(Series):
 
     def alike(self, other: Self) -> bool:
         """True where streams and frequencies are the same."""
-        f, g = self.frequency, other.frequency
+        f = self.frequency
+        g = other.frequency
         same = f.shape == g.shape and np.allclose(f, g, rtol=1e-12)
         return self.psd.keys() == other.psd.keys() and same
 
     def __iadd__(self, other: Self) -> Self:
         """The mean of all scans; the periodograms of all count."""
         if self.alike(other):
-            self.averages, self.detectors = self.averages + other.averages, other.detectors
+            self.averages = self.averages + other.averages
+            self.detectors = other.detectors
         return super().__iadd__(other)
 
     def regimes(self) -> list[tuple[str, float, float]]:
@@ -184,7 +188,8 @@ class Spectrum(Series):
             laws["white"] = np.full(self.frequency.size, self.white_level)
         if len(laws) < 2:
             return []
-        names, f = list(laws), self.frequency
+        names = list(laws)
+        f = self.frequency
         largest = np.argmax(np.array(list(laws.values())), axis=0)
         cuts = [0, *(np.flatnonzero(np.diff(largest)) + 1).tolist(), f.size]
         ends = [float(f[0]), *(math.sqrt(f[k - 1] * f[k]) for k in cuts[1:-1]), float(f[-1])]
@@ -199,7 +204,8 @@ class Spectrum(Series):
         """
         if not {"pink", "white"} <= set(self.psd):
             return None
-        pink, white = self.psd["pink"], self.psd["white"]
+        pink = self.psd["pink"]
+        white = self.psd["white"]
         found = crossing(self.frequency, pink, white)
         return None if isinstance(found, str) else found[0]
 
@@ -233,7 +239,8 @@ def crossing(frequency: Floats, upper: Floats, lower: Floats) -> tuple[float, fl
         ln f_x: zero of the line through both bins,   sigma_ln f = (c / n)^(1/2) s / |d|     (2)
     """
     good = (upper > 0) & (lower > 0)
-    f, ratio = np.log(frequency[good]), np.log(upper[good] / lower[good])
+    f = np.log(frequency[good])
+    ratio = np.log(upper[good] / lower[good])
     reach = float(np.ptp(f)) if f.size > 1 else 1.0
     number = np.clip((BINS * (f - f.min(initial=np.inf)) / reach).astype(int), 0, BINS - 1)
     count = np.bincount(number, minlength=BINS)
@@ -403,7 +410,8 @@ class Modes(Series):
     def tables(self) -> dict[str, list[Column]]:
         """The singular values, the largest first; and the leading modes in time."""
         used = self.values.any(axis=0)
-        share, rms = self.shares[used], np.sqrt((self.values[:, used] ** 2).mean(axis=0))
+        share = self.shares[used]
+        rms = np.sqrt((self.values[:, used] ** 2).mean(axis=0))
         error = "standard error of share from its scatter over scans; nan: one scan"
         before = "share of this mode and those before"
         values = [

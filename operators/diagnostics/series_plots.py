@@ -84,7 +84,8 @@ def draw_spectra(spectrum: Spectrum, file: str, where: str) -> list[Sketch]:
             caption += " in elevation."
         unit = {"K_RJ": ", Rayleigh–Jeans [K²/Hz]", "m": " [m²/Hz]"}.get(kind, " [1/Hz]")
         ax = _spectra(replace(spectrum, psd=psd))
-        title, up = f"Power spectra of the time streams {where}", f"power spectral density{unit}"
+        title = f"Power spectra of the time streams {where}"
+        up = f"power spectral density{unit}"
         finish(ax, "frequency [Hz]", up, title, fontsize=9, loc="upper right")
         name = file if sky else f"{file}_{'_'.join(psd)}"
         made.append(Sketch(name, "Power spectra", caption, ax))
@@ -107,14 +108,17 @@ def _spectra(spectrum: Spectrum) -> Any:
         "pink": "pink noise",
         "white": "white noise",
     }
-    top, bottom = 0.0, np.inf
+    top = 0.0
+    bottom = np.inf
     others = [name for name in spectrum.psd if name not in COLOURS]
     colours = COLOURS | dict(zip(others, (OTHER, *SEQUENCE[4:], *SEQUENCE), strict=False))
     for name, psd in spectrum.psd.items():
         good = np.isfinite(psd) & (psd > 0)
         if not good.any():
             continue
-        colour, x, y = colours.get(name, OTHER), spectrum.frequency[good], psd[good]
+        colour = colours.get(name, OTHER)
+        x = spectrum.frequency[good]
+        y = psd[good]
         ax.loglog(x, y, color=colour, linewidth=0.5, alpha=0.25)
         mean = _binned(x, y)
         width, order = (2.2, 3) if name == "signal" else (1.6, 2.5)
@@ -125,7 +129,8 @@ def _spectra(spectrum: Spectrum) -> Any:
             bottom = min(bottom, float(np.percentile(mean[1], 5)))
     floor = spectrum.white_level if {"white", "signal"} & set(spectrum.psd) else 0.0
     if floor > 0:
-        top, bottom = max(top, floor), min(bottom, floor)
+        top = max(top, floor)
+        bottom = min(bottom, floor)
     if 0 < bottom < top:
         ax.set_ylim(max(bottom * 1e-2, min(floor or bottom, top) * 1e-4), top * 5)
     ax.set_xlim(spectrum.frequency[0], spectrum.frequency[-1])
@@ -145,7 +150,8 @@ def _mark_regimes(ax: Any, regimes: Sequence[tuple[str, float, float]]) -> None:
     low, high = np.log10(ax.get_xlim())
     style: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "ha": "center", "va": "bottom"}
     for name, start, stop in regimes:
-        colour, at = COLOURS[name], (np.sqrt(start * stop), 0.012)
+        colour = COLOURS[name]
+        at = (np.sqrt(start * stop), 0.012)
         ax.axvspan(start, stop, color=colour, alpha=0.07, linewidth=0, zorder=0)
         if np.log10(stop / start) / (high - low) > 0.015 * len(words[name]):
             ax.annotate(words[name], at, color=colour, fontsize=8.5, bbox=PALE, zorder=4, **style)
@@ -177,17 +183,20 @@ def draw_transfer(transfer: Transfer, file: str, where: str) -> list[Sketch]:
     """
     ax = new_axes(size=(7.2, 5.0), above=0.9)
     r = transfer.rings
-    scale, edges = transfer.scale / ARCSEC, 1 / transfer.edges / ARCSEC
+    scale = transfer.scale / ARCSEC
+    edges = 1 / transfer.edges / ARCSEC
     known = r.amplitude <= LARGEST_RATIO  # and no NaN
     width = np.stack([np.abs(scale - edges[1:]), np.abs(edges[:-1] - scale)])[:, known]
     style: dict[str, Any] = {"fmt": "o", "markersize": 4, "label": "T: share in phase"}
-    error, shown = np.nan_to_num(r.error[known]), (r.transfer[known], r.amplitude[known])
+    error = np.nan_to_num(r.error[known])
+    shown = (r.transfer[known], r.amplitude[known])
     ax.errorbar(scale[known], shown[0], yerr=error, xerr=width, color=SEQUENCE[0], **style)
     label = "S: ratio of amplitudes"
     ax.plot(scale[known], shown[1], "--", color=SEQUENCE[1], linewidth=1.2, label=label)
     ax.set_xscale("log")
     ax.set_xlim(edges[0], edges[-1])
-    top, bottom = float(np.max(shown, initial=1.0)), float(np.min(shown, initial=0.0))
+    top = float(np.max(shown, initial=1.0))
+    bottom = float(np.min(shown, initial=0.0))
     ax.set_ylim(1.05 * bottom, 1.15 * top)
     ax.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
     if transfer.fwhm > 0 and edges[-1] <= transfer.fwhm / ARCSEC <= edges[0]:
@@ -223,7 +232,8 @@ def draw_streams(stream: TimeStream, file: str, where: str) -> list[Sketch]:
             meaning = "along the line of sight, without its mean"
         what = f"Stream {name} of {len(stream.names)} detectors {where}: {meaning}"
         caption = f"{what}. Pale: samples; dark: means over 1 s."
-        ax, title = new_axes((7.2, 3.6)), f"Time streams of {stream.observation} {where}"
+        ax = new_axes((7.2, 3.6))
+        title = f"Time streams of {stream.observation} {where}"
         draw_stream(
             ax,
             name,

@@ -43,10 +43,8 @@ from zonda.core.types import Floats
 from .comparison.radial import Rings, correlation, scale_of, tapered
 from .series import check_map, key_of, kinds_of_maps, plane_key
 
-NOT_TAN, CURE = (
-    "a transfer function needs a TAN map of the signal",
-    "leave nside, projection and contents of the map out",
-)
+NOT_TAN = "a transfer function needs a TAN map of the signal"
+CURE = "leave nside, projection and contents of the map out"
 
 NO_POWER = 1e-12
 """Share of the largest ring's power per mode below which a ring holds nothing but rounding."""
@@ -144,12 +142,14 @@ class TransferFunction(Output):
     def _edges(self, before: MapProduct, window: Floats) -> Floats:
         """(bins + 1,) wavenumbers between the rings, rad^-1."""
         if not window.any():
-            what, cure = "no pixel is left in the window", "choose a larger radius"
+            what = "no pixel is left in the window"
+            cure = "choose a larger radius"
             raise PipelineError(what, place=self.label, cure=cure)
         smallest = self.smallest or max(before.fwhm, 2 * before.pixel)
         largest = self.largest or 2 * before.pixel * math.sqrt(np.count_nonzero(window) / math.pi)
         if largest <= smallest:
-            low, high = smallest / ARCSEC, largest / ARCSEC
+            low = smallest / ARCSEC
+            high = largest / ARCSEC
             what = f"scales from {high:.3g} to {low:.3g} arcsec are none"
             cure = "set largest and smallest, or map a larger field"
             raise PipelineError(what, place=self.label, cure=cure)
@@ -195,7 +195,8 @@ def compare(before: Floats, after: Floats, window: Floats, pixel: float, edges: 
     """
     rings = Rings((before, after), window, pixel, edges)
     a, b = (rings.transform(m) for m in (before, after))
-    power, modes = rings.sum(abs(a) ** 2), rings.number / 2 / (c := correlation(rings.window))
+    power = rings.sum(abs(a) ** 2)
+    modes = rings.number / 2 / (c := correlation(rings.window))
     with np.errstate(invalid="ignore", divide="ignore"):
         transfer = rings.sum((b * a.conj()).real) / power
         amplitude = np.sqrt(rings.sum(abs(b) ** 2) / power)
@@ -221,7 +222,8 @@ def window_of(
     """
     from scipy.ndimage import binary_fill_holes, gaussian_filter
 
-    seen, sigma = product.known, product.fwhm / FWHM_PER_SIGMA / product.pixel
+    seen = product.known
+    sigma = product.fwhm / FWHM_PER_SIGMA / product.pixel
     hits = gaussian_filter(product.known_hits.astype(np.float64), sigma, mode="constant")
     usual = float(np.percentile(hits[seen], 99)) if seen.any() else np.inf
     inside = hits >= max(least * usual, 1e-9)
@@ -273,7 +275,8 @@ class Transfer:
 
     def columns(self) -> list[Column]:
         """The table, largest scale first."""
-        r, share = self.rings, "Re sum b a* / sum |a|^2: share that the filters leave, in phase"
+        r = self.rings
+        share = "Re sum b a* / sum |a|^2: share that the filters leave, in phase"
         error = "standard error of transfer from the scatter of the ring's modes"
         return [
             Column("scale", self.scale / ARCSEC, "arcsec", "1 / mean wavenumber of the ring"),

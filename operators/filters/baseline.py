@@ -81,7 +81,8 @@ class Basis:
         """Matrix that `solved` takes for the samples ``use`` (N,): `inverse`, or for `MANY`
         functions, all of them determined and each overlapping with few, a factor (taps, K).
         """
-        normal, factor = self.normal(use), np.zeros((len(self.functions), self.size))
+        normal = self.normal(use)
+        factor = np.zeros((len(self.functions), self.size))
         if self.size < max(MANY, len(factor) + 1) or not _factor(
             normal,
             DETERMINED * normal.diagonal().max(),
@@ -103,7 +104,8 @@ class Basis:
     def sums_of_bins(self, rows: Rows, use: Mask, bins: Bins, number: int) -> tuple[Floats, Floats]:
         """(n_det, K): `sums`, and (n_det, number) sums over bins, in one reading."""
         n = len(rows.values)
-        sums, totals = np.zeros((n, self.size)), np.zeros((n, number))
+        sums = np.zeros((n, self.size))
+        totals = np.zeros((n, number))
         _sums(*rows, use, self.functions, self.stops, self.firsts, *bins, sums, totals)
         return sums, totals
 
@@ -179,7 +181,8 @@ class Fit:
         """Coefficients that `remove` subtracts, (n_det, K), and the number of samples that are not
         finite.
         """
-        sums, spoilt = self.basis.sums(rows, self.use), 0
+        sums = self.basis.sums(rows, self.use)
+        spoilt = 0
         found = solved(self.inverse, sums)
         other = ~np.isfinite(sums).all(axis=1)
         if masked is not None:
@@ -188,7 +191,8 @@ class Fit:
             row = rows.double(slice(d, d + 1), len(self.use))
             finite = np.isfinite(row[0])
             row[0, ~finite] = 0.0
-            use, inverse = self.use, self.inverse
+            use = self.use
+            inverse = self.inverse
             if not finite.all():
                 use = use & finite
                 inverse = self.basis.solver(use)
@@ -204,7 +208,8 @@ class Fit:
         """
         sums = self.basis.sums(rows, np.ones(len(self.use), bool))
         for d, total in enumerate(sums if more is None else sums + more):
-            use, inverse = self.use, self.inverse
+            use = self.use
+            inverse = self.inverse
             if masked is not None and masked[d].any():
                 use, inverse = self._outside(use, inverse, masked[d])
             kept = rows.values[d, ~use]
@@ -215,9 +220,11 @@ class Fit:
         """Samples to use outside of a mask (N,), and their inverse; those that are given where
         equation (2) forbids it.
         """
-        left, basis = use & ~masked, self.basis
+        left = use & ~masked
+        basis = self.basis
         whole = inverse if len(inverse) == basis.size else basis.inverse(use)
-        outside, inside = basis.normal(left), basis.normal(use & masked)
+        outside = basis.normal(left)
+        inside = basis.normal(use & masked)
         found = _inverse(outside)
         lost = np.trace(whole @ basis.normal(use)) - np.trace(found @ outside)
         if lost > 0.5 or np.trace(found @ inside) > np.count_nonzero(use & masked):

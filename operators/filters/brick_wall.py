@@ -151,7 +151,8 @@ class HighpassPlan:
         """Coarse coefficients c_m, m = -1 .. M + 1, of P x from s, (n_det, M + 3) each."""
         if self.sums:
             half = -(-s.shape[1] // 2)
-            left, right = s[:, :half], s[:, : -half - 1 : -1]
+            left = s[:, :half]
+            right = s[:, : -half - 1 : -1]
             even, odd = (
                 product(product(x, a), b)
                 for x, (a, b) in zip((left + right, left - right), self.sums, strict=True)
@@ -235,7 +236,8 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
         knots = 0
     if not knots:
         powers = np.polynomial.legendre.legvander((2 * np.arange(n) + 1) / n - 1, degree)
-        basis, none = np.linalg.qr(powers)[0].T.copy(), np.zeros((0, 0))
+        basis = np.linalg.qr(powers)[0].T.copy()
+        none = np.zeros((0, 0))
         return HighpassPlan(n, cut, 0, np.zeros(0, np.int64), 5, none, none, basis, np.zeros(0))
     # polynomials through their B-spline coefficients: B * (t^2) = t^2 + 1/3, B * (t^3) = t^3 + t
     t = (np.arange(knots + 3) - 1) * (2 / knots) - 1
@@ -253,7 +255,8 @@ def plan_highpass(n: int, frequency: float, degree: int, oversampling: float) ->
     norm = np.linalg.inv(np.linalg.cholesky(raw @ spread.T))
     sinc = np.sinc(np.arange(cut) / (2 * knots)) ** 4
     response = 1 / (2 * n * sinc**2)
-    modes, spread = norm @ raw, norm @ spread
+    modes = norm @ raw
+    spread = norm @ spread
     sums = _sums(modes, spread, response) if 0 < cut <= FEW and knots <= CLOSE else ()
     return HighpassPlan(
         n, cut, knots, *_groups(n, knots), modes, spread, np.zeros((0, n)), response, sums
@@ -277,9 +280,12 @@ def _sums(
         np.pi * np.multiply.outer(np.arange(response.size), (np.arange(knots) - 1) / (knots - 3))
     )
     factor = np.where(np.arange(response.size) > 0, 4.0, 2.0) * response
-    half, found = -(-knots // 2), []
+    half = -(-knots // 2)
+    found = []
     for parity in range(2):
-        p, c, r = modes[parity::2], cosines[parity::2], factor[parity::2, None]
+        p = modes[parity::2]
+        c = cosines[parity::2]
+        r = factor[parity::2, None]
         into = np.concatenate([p, c])[:, :half].T.copy()
         if knots % 2:
             into[-1] /= 2  # the knot in the middle comes twice
@@ -320,7 +326,8 @@ def _weights(
         cell, weights = _around(samples, n, knots)
         weights[:, max(n - samples.start, 0) :] = 0.0
         part = slice(samples.start // GROUP, samples.stop // GROUP)
-        later, each = cell.reshape(-1, GROUP) - first[part, None], weights.reshape(4, -1, GROUP)
+        later = cell.reshape(-1, GROUP) - first[part, None]
+        each = weights.reshape(4, -1, GROUP)
         for k in range(taps):
             found[part, k] = sum(
                 np.where(later == k - j, each[j], 0.0)

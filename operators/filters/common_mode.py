@@ -109,9 +109,13 @@ def read_mean(stream: Stream, use: Mask, good: Mask, inside: Inside | None = Non
         moments = np.zeros((-(-n // TILE_SAMPLES), 2, rows))
         for here, added in zip(chunks(n, TILE_SAMPLES), moments, strict=True):
             at = slice(samples.start + here.start, samples.start + here.stop)
-            tile, begin, end = part, here.start, here.stop
+            tile = part
+            begin = here.start
+            end = here.stop
             if field is not None or inside is not None or not good[at].all():
-                tile, begin, end = part[:, here].astype(np.float64), 0, here.stop - here.start
+                tile = part[:, here].astype(np.float64)
+                begin = 0
+                end = here.stop - here.start
                 if field is not None:
                     tile += field.evaluate(detectors, at)
                 tile[:, ~good[at]] = 0
@@ -301,8 +305,10 @@ class CommonModeFilter(LinearFilter):
         B <- B - sum_i R^-1 u_i (B^T R u_i)^T at good samples. In a source mask, what a sample is
         filled with is given back to those that it is the mean of.
         """
-        signal, good = block.detdata["signal"], block.observation.good_samples
-        inside, every = self._inside(block.observation), block.detectors
+        signal = block.detdata["signal"]
+        good = block.observation.good_samples
+        inside = self._inside(block.observation)
+        every = block.detectors
         for modes in state.parts or (state,):
             unit = np.ones(len(signal)) if modes.scale is None else modes.scale
             use = np.asarray(modes.detectors.any(axis=0))[:, None]
@@ -324,9 +330,11 @@ class CommonModeFilter(LinearFilter):
 
     def _wafer_by_wafer(self, stream: Stream, model: Modes | None) -> Modes:
         """The modes of each wafer's detectors: all others count as flagged."""
-        whole, parts = stream.observation, []
+        whole = stream.observation
+        parts = []
         for k, wafer in enumerate(np.unique(whole.focalplane.wafer).tolist()):
-            part, others = copy.copy(stream), whole.focalplane.wafer != wafer
+            part = copy.copy(stream)
+            others = whole.focalplane.wafer != wafer
             part.observation = copy.copy(whole)
             part.observation.name = f"{whole.name}, wafer {wafer}"
             part.observation.detector_flags = whole.detector_flags | np.where(
@@ -377,7 +385,8 @@ class ModeSearch:
 
         Raises PipelineError if float32 cannot carry the mean emission, or the modes.
         """
-        step, stream = self.step, self.stream
+        step = self.step
+        stream = self.stream
         place = f"{step.label}, {stream.observation.name}"
         if stream.means.get("signal") is not None and stream.dtype != np.float64:
             raise PipelineError(
@@ -395,9 +404,11 @@ class ModeSearch:
 
     def of(self, model: Modes) -> Modes:
         """Equation (3) of `common_mode`: v_i = B^T u_i, or B^T R^-1 u_i, of given modes."""
-        stream, inside = self.stream, self.inside
+        stream = self.stream
+        inside = self.inside
         modes = model.detectors if model.scale is None else model.detectors / model.scale
-        use, good = np.asarray(modes.any(axis=0)), stream.observation.good_samples
+        use = np.asarray(modes.any(axis=0))
+        good = stream.observation.good_samples
         if self.step.method == "mean":
             total = read_mean(stream, use, good, inside).total
             times = [total * u.max(initial=0.0) for u in modes]
@@ -411,7 +422,9 @@ class ModeSearch:
 
     def _singular_modes(self) -> tuple[Usable, Ritz]:
         """The leading singular modes, with the number of those to remove."""
-        step, stream, inside = self.step, self.stream, self.inside
+        step = self.step
+        stream = self.stream
+        inside = self.inside
         with ThreadPoolExecutor(max(1, stream.threads)) as pool:
             gram = Gram(stream, pool, None, _sees_nothing(stream), inside, step.scale == "rms")
             gap = None if step.on_undetermined == "remove" else step.gap
@@ -421,7 +434,9 @@ class ModeSearch:
 
     def _mean_mode(self) -> tuple[Usable, Ritz]:
         """The detectors' mean as the only mode: u = 1 / sqrt(n) over the good detectors."""
-        stream, inside, observation = self.stream, self.inside, self.stream.observation
+        stream = self.stream
+        inside = self.inside
+        observation = self.stream.observation
         good = observation.good_samples
         detectors = Usable(observation.good_detectors, int(good.sum()))
         reading = read_mean(stream, detectors.use, good, inside)
@@ -433,7 +448,8 @@ class ModeSearch:
             root = np.sqrt(detectors.n_good)
             v = reading.total / root
             rank = 1 + (reading.least_left > NOTHING * detectors.energy)
-            u, values = detectors.use / root, np.array([v @ v])
+            u = detectors.use / root
+            values = np.array([v @ v])
             found = Ritz(values, u[None], v[None], np.zeros(1), rank, 1, "detector mean")
         found.count = min(1, max(0, found.rank - 1))
         observation.log.count(self.step.label, KEPT, 1 - found.count)
@@ -441,7 +457,8 @@ class ModeSearch:
 
     def _choose(self, found: Ritz, gram: Gram) -> int:
         """Number of modes to remove; may replace the modes by the detectors' mean."""
-        step, log = self.step, self.stream.observation.log
+        step = self.step
+        log = self.stream.observation.log
         wanted = min(step.modes, max(0, found.rank - 1))
         size = np.append(np.sqrt(np.maximum(found.values, 0.0)), 0.0)
         determined = max(
@@ -462,8 +479,11 @@ class ModeSearch:
 
     def _tell(self, detectors: Usable, found: Ritz) -> None:
         """State what was found; flag the dead detectors, which the complete signal shows."""
-        stream, inside = self.stream, self.inside
-        observation, log, who = stream.observation, stream.observation.log, self.step.label
+        stream = self.stream
+        inside = self.inside
+        observation = stream.observation
+        log = stream.observation.log
+        who = self.step.label
         if inside is not None:
             masked, covered = counts(inside, observation.n_detectors, observation.n_samples)
             log.count(who, MASKED, masked, observation.n_detectors * observation.n_samples)
@@ -502,10 +522,8 @@ def _check_precision(found: Ritz, detectors: Usable, stream: Stream, place: str)
     )
     if 0.01 * np.sqrt(left) < ROUNDING:
         unit = 1.0 if detectors.scale is None else float(np.median(detectors.scale[detectors.use]))
-        rms, ratio = (
-            unit * np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used)),
-            1 / max(np.sqrt(left), 1e-30),
-        )
+        rms = unit * np.sqrt(detectors.energy / (detectors.n_good * detectors.n_used))
+        ratio = 1 / max(np.sqrt(left), 1e-30)
         raise PipelineError(
             f"the common mode, {rms:.3g} K rms, is {ratio:.1e} times what is left, more than"
             " float32 can carry",

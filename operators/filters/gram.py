@@ -109,7 +109,8 @@ def lanczos(gram: Gram, wanted: int, residual: float, gap: float | None) -> Ritz
         rest[~gram.use] = 0.0
         beta = float(np.linalg.norm(rest))
         values, vectors = np.linalg.eigh(projected[:m, :m])
-        values, vectors = values[::-1], vectors[:, ::-1]
+        values = values[::-1]
+        vectors = vectors[:, ::-1]
         floor = EMPTY * n * gram.energy
         residuals = beta * np.abs(vectors[-1]) / np.maximum(values, floor)
         exhausted = m == min(n, len(projected)) or gram.energy - float(values.sum()) <= floor
@@ -197,7 +198,9 @@ class Usable:
     """
 
     def __init__(self, use: Bools, n_used: int) -> None:
-        self.use, self.n_used, self.energy = use, n_used, 0.0
+        self.use = use
+        self.n_used = n_used
+        self.energy = 0.0
         self.scale: Floats | None = None
         self.not_finite = self.constant = np.zeros(use.size, bool)
 
@@ -256,7 +259,9 @@ class Gram(Usable):
             stream.observation.good_detectors if use is None else use,
             int(self.good_samples.sum()),
         )
-        self.stream, self.pool, self.n_samples = stream, pool, stream.shape[1]
+        self.stream = stream
+        self.pool = pool
+        self.n_samples = stream.shape[1]
         self.length = tile_length(stream.shape[0], stream.dtype.itemsize)
         self.copied = isinstance(stream.array, np.memmap)
         self.inside, self.copied = inside, self.copied or inside is not None
@@ -298,7 +303,8 @@ class Gram(Usable):
         """``act(array, start, stop)`` on an array that has these samples, mean emission included
         and zero where flagged, from ``start`` to ``stop``. Waits until there is memory for a copy,
         if it needs one."""
-        mean, good = self.stream.means.get("signal"), self.good_samples[samples]
+        mean = self.stream.means.get("signal")
+        good = self.good_samples[samples]
         if not self.copied and mean is None and good.all():
             return act(np.asarray(self.stream.array), samples.start, samples.stop)
         with self._copies:
@@ -313,7 +319,9 @@ class Gram(Usable):
 
     def _fill(self, tile: NDArray[Any], samples: slice, inside: Inside) -> None:
         """Replace the samples of a tile (n_det, n) that are inside the mask."""
-        total, count, masks = np.zeros(tile.shape[1]), np.zeros(tile.shape[1], np.int64), []
+        total = np.zeros(tile.shape[1])
+        count = np.zeros(tile.shape[1], np.int64)
+        masks = []
         unit = np.ones(len(tile)) if self.scale is None else self.scale
         for rows in chunks(len(tile), ROWS):
             masks.append(inside.at(rows, samples))
@@ -365,7 +373,8 @@ class Gram(Usable):
                 )
             return parts
 
-        threads, most = self.stream.threads, max(1, PARTS // (24 * q.size))
+        threads = self.stream.threads
+        most = max(1, PARTS // (24 * q.size))
         at_least = min(SEVERAL, most, -(-len(tiles) // threads))
         size = max(1, at_least, min(len(tiles) // (4 * threads), most) // SEVERAL * SEVERAL)
         for parts in self._each(work, [tiles[k : k + size] for k in range(0, len(tiles), size)]):

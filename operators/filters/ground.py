@@ -88,7 +88,8 @@ def _bins(observation: Observation, width: float, split: bool) -> Integers:
     )
     around = round(2 * np.pi / width)
     if abs(around * width - 2 * np.pi) > 1e-9:  # no whole number of bins
-        azimuth, around = azimuth % (2 * np.pi), 1 << 32
+        azimuth = azimuth % (2 * np.pi)
+        around = 1 << 32
     number = (
         np.floor_divide(azimuth, width).astype(np.int64) % around
     )  # as TOAST, at the edges of bins too
@@ -153,7 +154,8 @@ class Template:
         """Transpose of equation (3) on float64 rows in place: all samples are summed up, those that
         are used change.
         """
-        every, basis = np.ones(len(self.use), bool), self.trend.basis
+        every = np.ones(len(self.use), bool)
+        basis = self.trend.basis
         sums, means = basis.sums_of_bins(rows, every, self.runs, len(self.share))
         kept = rows.values[:, ~self.use]
         basis.subtract(rows, solved(self.trend.inverse, sums), self.runs, means * self.share)

@@ -29,7 +29,8 @@ from .brick_wall import HighpassPlan, first_kept, plan_highpass
 from .rows import SPOILT, LinearFilter, Mask, Rows
 from .source_mask import Inside, SourceMask, adjoint_outside, filter_outside
 
-ONLY_THE_MEAN, ONLY_A_LINE = "only the mean is removed", "only the mean and a line are removed"
+ONLY_THE_MEAN = "only the mean is removed"
+ONLY_A_LINE = "only the mean and a line are removed"
 
 POLES = 4
 """Of the Bessel filter, as in the authors' code."""
@@ -101,8 +102,11 @@ class HighpassFilter(LinearFilter):
 
     def prepare(self, observation: Observation) -> tuple[Bridged, Inside | None]:
         """Tables for this observation's length, flagged samples; flags the trimmed ends."""
-        n, rate, log = observation.n_samples, observation.sample_rate, observation.log
-        fine, trimmed = has_a_signal(observation.flags), self._check_length(observation)
+        n = observation.n_samples
+        rate = observation.sample_rate
+        log = observation.log
+        fine = has_a_signal(observation.flags)
+        trimmed = self._check_length(observation)
         observation.flags[:trimmed] |= TRIMMED
         observation.flags[n - trimmed :] |= TRIMMED
         log.count(self.label, "samples trimmed", 2 * trimmed, n)
@@ -149,9 +153,11 @@ class HighpassFilter(LinearFilter):
             raise PipelineError(text, place=place, cure="shorten trim or lengthen the scan")
         bessel = self.response == "bessel"
         if self.frequency >= rate / 2 if bessel else first_kept(n, self.frequency / rate) >= n:
-            highest, more = rate / 2, ""
+            highest = rate / 2
+            more = ""
             if not bessel:
-                highest, more = (n - 1) / n * rate / 2, ", or lengthen the scan"
+                highest = (n - 1) / n * rate / 2
+                more = ", or lengthen the scan"
             raise PipelineError(
                 f"a cut at {self.frequency:g} Hz removes everything: {n} samples at {rate:g} Hz"
                 " contain no higher frequency",

@@ -124,7 +124,8 @@ class PolynomialFilter(LinearFilter):
 
     def prepare(self, observation: Observation) -> tuple[Removal, Inside | None]:
         """The fits to this observation's good samples; flags what is in no interval."""
-        n, parts = observation.n_samples, self._parts(observation)
+        n = observation.n_samples
+        parts = self._parts(observation)
         pieces = Pieces.of(parts, self.order, has_a_signal(observation.flags))
         observation.flags[pieces.outside] |= TRIMMED
         observation.log.count(
@@ -184,7 +185,8 @@ class Pieces:
         for part in parts:
             outside[part] = False
         fits = [Fit.of(polynomials(p.stop - p.start, order), use[p]) for p in parts]
-        starts, stops = [0, *(p.stop for p in parts)], [*(p.start for p in parts), len(use)]
+        starts = [0, *(p.stop for p in parts)]
+        stops = [*(p.start for p in parts), len(use)]
         gaps = [
             (k, slice(a, b), polynomials(b - a, 1))
             for k, (a, b) in enumerate(zip(starts, stops, strict=True))
@@ -194,7 +196,8 @@ class Pieces:
 
     def remove(self, rows: Rows, masked: Bools | None = None) -> int:
         """Equation (1) on rows in place; the rest as of `Fit.remove`."""
-        spoilt, removed = 0, list[Floats]()
+        spoilt = 0
+        removed = list[Floats]()
         for part, fit in zip(self.parts, self.fits, strict=True):
             found, bad = fit.coefficients(
                 rows.at(part.start),
@@ -205,7 +208,9 @@ class Pieces:
             spoilt += bad
         removed = [removed[0], *removed, removed[-1]]
         for k, gap, lines in self.gaps:
-            before, behind, n = removed[2 * k], removed[2 * k + 1], gap.stop - gap.start
+            before = removed[2 * k]
+            behind = removed[2 * k + 1]
+            n = gap.stop - gap.start
             line = (
                 (before + behind) / 2,
                 (behind - before) / (2 + 2 / n),

@@ -110,10 +110,13 @@ class LinearFilter(Operator):
     def exec(self, block: Block, state: Any) -> None:
         """Subtract the fit from each row and its mean; no mean is left beside the rows."""
         (fit, inside), signal, log = state, block.detdata["signal"], block.observation.log
-        mean, spoilt, n_masked = block.means.pop("signal", None), 0, 0
+        mean = block.means.pop("signal", None)
+        spoilt = 0
+        n_masked = 0
         for part in chunks(len(signal), ROWS):
             detectors = slice(block.detectors.start + part.start, block.detectors.start + part.stop)
-            rows, masked = Rows.of(signal[part]), None
+            rows = Rows.of(signal[part])
+            masked = None
             if mean is not None:
                 lines, cell, between = mean.series(detectors, block.samples, np.dtype(np.float64))
                 rows = Rows(signal[part], lines, cell, between, block.samples.start, 0)

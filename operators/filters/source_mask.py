@@ -96,8 +96,10 @@ class SourceMask(Parameters):
         Raises InputError for a file that cannot be used, and PipelineError where the mask covers
         all that the middle detector sees.
         """
-        inside, plane = self.of(observation), observation.focalplane
-        middle, n = int(np.argmin(np.hypot(plane.xi, plane.eta))), observation.n_samples
+        inside = self.of(observation)
+        plane = observation.focalplane
+        middle = int(np.argmin(np.hypot(plane.xi, plane.eta)))
+        n = observation.n_samples
         judged = n >= min(ENOUGH, observation.sampling[0])
         if judged and inside.at(slice(middle, middle + 1), slice(0, n)).all():
             raise PipelineError(
@@ -178,7 +180,8 @@ class InsideDisc:
 
     def at(self, detectors: slice, samples: slice) -> Bools:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
-        a, b = self.rays[:, detectors], self.centre[:, samples]
+        a = self.rays[:, detectors]
+        b = self.centre[:, samples]
         found = np.zeros((a.shape[1], b.shape[1]))
         for k in range(3):
             found += (a[k, :, None] - b[k]) ** 2
@@ -187,10 +190,13 @@ class InsideDisc:
 
 def counts(inside: Inside, n_detectors: int, n_samples: int) -> tuple[int, int]:
     """(samples of all detectors inside, instants at which all detectors are)."""
-    every, number, covered = slice(0, n_detectors), 0, 0
+    every = slice(0, n_detectors)
+    number = 0
+    covered = 0
     for samples in chunks(n_samples, 1 << 10):
         found = inside.at(every, samples)
-        number, covered = number + int(found.sum()), covered + int(found.all(axis=0).sum())
+        number = number + int(found.sum())
+        covered = covered + int(found.all(axis=0).sum())
     return number, covered
 
 
@@ -207,7 +213,8 @@ def filter_outside(
     were none.
     """
     lost = np.flatnonzero(~np.isfinite(row))
-    spoilt, gaps = row[lost], np.union1d(bad, lost)
+    spoilt = row[lost]
+    gaps = np.union1d(bad, lost)
     if gaps.size == row.size:
         return int(lost.size)
     masked, every = _bridged(gaps, inside)
@@ -265,11 +272,14 @@ class InsideImage:
 
     def at(self, detectors: slice, samples: slice) -> Bools:
         """(n_det, n): True inside; it depends on absolute detectors and samples alone."""
-        xi, eta, h = self.xi[detectors, None], self.eta[detectors, None], self.h[:, samples]
+        xi = self.xi[detectors, None]
+        eta = self.eta[detectors, None]
+        h = self.h[:, samples]
         x, y, w = (h[k] * xi + h[k + 1] * eta + h[k + 2] for k in (0, 3, 6))
         ny, nx = self.masked.shape
         with np.errstate(invalid="ignore", divide="ignore"):
-            column, row = np.floor(x / w + 0.5), np.floor(y / w + 0.5)
+            column = np.floor(x / w + 0.5)
+            row = np.floor(y / w + 0.5)
             here = (w > 0) & (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
         found = np.zeros(here.shape, bool)
         found[here] = self.masked[row[here].astype(np.int64), column[here].astype(np.int64)]
@@ -290,7 +300,8 @@ def _read(path: Path, changed: int) -> tuple[Bools, Floats]:
         if hdu is None:
             raise InputError("has no two-dimensional image", place=place, cure=CURE)
         check_size(hdu, place)
-        values, header = np.array(hdu.data), hdu.header.copy()
+        values = np.array(hdu.data)
+        header = hdu.header.copy()
     if np.isnan(values).any():
         raise InputError(
             "has pixels that are NaN",

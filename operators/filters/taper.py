@@ -56,11 +56,9 @@ class Taper(LinearFilter):
         """Multiply the block's rows in place. Beside a mean M that stands beside x, W (x + M) - M
         takes the place of x.
         """
-        window, signal, mean = (
-            state[block.samples],
-            block.detdata["signal"],
-            block.means.get("signal"),
-        )
+        window = state[block.samples]
+        signal = block.detdata["signal"]
+        mean = block.means.get("signal")
         if mean is None:
             signal *= window
             return

@@ -121,7 +121,8 @@ class Reader(toast_hdf5.Reader):
     def _opened(self) -> tuple[TimeOrderedData, Any]:
         group = _root(self._file)
         aman = Fields(group, self.place)
-        names, n = ([str(name) for name in aman.axis("dets")], int(aman.axis("samps")))
+        names = [str(name) for name in aman.axis("dets")]
+        n = int(aman.axis("samps"))
         times = aman.numbers("timestamps", n)
         if n < 2 or not (interval := float(np.median(np.diff(times)))) > 0:
             raise ValueError("its timestamps do not increase")
@@ -129,7 +130,8 @@ class Reader(toast_hdf5.Reader):
         known = np.isfinite(gamma) & (np.hypot(xi, eta) < 1)
         xi, eta, gamma = (np.where(known, angle, 0.0) for angle in (xi, eta, gamma))
         cosine = np.sqrt(1 - xi**2 - eta**2)  # theirs are sines
-        xi, eta = xi / cosine, eta / cosine
+        xi = xi / cosine
+        eta = eta / cosine
         columns = {"polarization_angle": gamma, "polarization_efficiency": np.ones(len(names))}
         info = aman.child("det_info")
         if (centre := _centres(info, len(names))) is not None:
@@ -217,8 +219,10 @@ def _site(about: Mapping[str, Any]) -> tuple[str, float, float, float]:
     Raises InputError if they are not stated and the telescope is none of the Simons Observatory's.
     """
     if {"latitude", "longitude", "altitude"} <= about.keys():
-        latitude, longitude = float(about["latitude"]), float(about["longitude"])
-        altitude, name = float(about["altitude"]), str(about.get("site", ""))
+        latitude = float(about["latitude"])
+        longitude = float(about["longitude"])
+        altitude = float(about["altitude"])
+        name = str(about.get("site", ""))
     else:
         telescope = str(about.get("telescope", "")).lower().replace("satp", "sat")
         if (key := telescope if telescope[:3] == "sat" else telescope[:3]) not in SITES:
@@ -233,7 +237,8 @@ def _take_flags(tod: TimeOrderedData, child: Fields) -> list[Flag]:
     """Put the file's flags into those of samples and of whole detectors of a scan, and into its
     intervals; return the flags of single detectors' samples.
     """
-    n, found = tod.n_samples, list[Flag]()
+    n = tod.n_samples
+    found = list[Flag]()
     for name in sorted(child.schema, key=lambda name: name != "turnarounds"):
         flag = child.flag(name, tod.n_detectors, n)
         if flag is None or name == UNION:
@@ -269,7 +274,8 @@ class Fields:
     """
 
     def __init__(self, group: Any, place: str) -> None:
-        self._group, self._place = group, place
+        self._group = group
+        self._place = place
         about: Any = {"version": 0, "schema": []}
         if group is not None:
             about = json.loads(group.attrs[SCHEMA])
@@ -334,7 +340,8 @@ class Fields:
         )
         if shape.tolist() not in ([n], [n_detectors, n]):
             return None
-        counts, steps = np.diff(ends, prepend=0), np.diff(spans)
+        counts = np.diff(ends, prepend=0)
+        steps = np.diff(spans)
         inner = ends[(ends > 0) & (ends < len(spans))]
         steps[inner - 1] = 0  # from one detector to the next
         fits = ends.shape == ((n_detectors if len(shape) == 2 else 1),) and ends[-1] == len(spans)

@@ -201,8 +201,10 @@ class Reader:
             missing = [name for name in TABLES if name not in file]
             if missing:
                 raise InputError(f"has no table {missing[0]}", place=self.place, cure=CURE)
-            self.tod, table = _read(file), file["TOD"]
-            columns, begin = table.columns, table.fileinfo()["datLoc"]
+            self.tod = _read(file)
+            table = file["TOD"]
+            columns = table.columns
+            begin = table.fileinfo()["datLoc"]
             self._row = int(table.header["NAXIS1"])
             if int(table.header["NAXIS2"]) != self.tod.n_detectors:
                 raise InputError(
@@ -274,7 +276,8 @@ def _read(file: Any) -> TimeOrderedData:
     samples, detectors, provenance = (
         file[name].data for name in ("SAMPLES", "DETECTORS", "PROVENANCE")
     )
-    about, intervals = file["SAMPLES"].header, dict[str, list[tuple[float, float]]]()
+    about = file["SAMPLES"].header
+    intervals = dict[str, list[tuple[float, float]]]()
     given = {k: _native(samples[name]) for name, _, _, k in SAMPLES if name in samples.names}
     given.pop("elevation", None)
     if "FLAGBITS" in about and "INTERVALS" not in file:

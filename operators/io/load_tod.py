@@ -138,7 +138,8 @@ class _Scans:
 
     def append(self) -> None:
         """Append the observations."""
-        step, given = self.step, self.data.scene
+        step = self.step
+        given = self.data.scene
         if self.data.observations:
             cure = (
                 "give all files to one LoadTOD, file: [FILE, ...], and leave out other steps that"
@@ -159,7 +160,8 @@ class _Scans:
         self.data.scene = given.model_copy(
             update={"site": own["site"], "instrument": own["instrument"]}
         )
-        most, known = 0, dict[Any, RecordedBand]()
+        most = 0
+        known = dict[Any, RecordedBand]()
         for scan in step.scans(given.instrument):
             for band in scan:
                 self._check_new(band, known)
@@ -176,7 +178,9 @@ class _Scans:
 
         Raises InputError if a file before it has one of them.
         """
-        tod, xi, eta = part.tod, part.tod.xi.tolist(), part.tod.eta.tolist()
+        tod = part.tod
+        xi = part.tod.xi.tolist()
+        eta = part.tod.eta.tolist()
         unused = (tod.detector_flags & np.uint8(self.step.detector_mask)) != 0
         for row in part.rows[~unused[part.rows]].tolist():
             key = str(tod.start), tod.names[row], xi[row], eta[row]
@@ -230,7 +234,9 @@ class _Scans:
 
     def _observation(self, bands: Scan) -> Observation:
         """A scan; where the camera has several bands, their detectors follow each other."""
-        tod, scene, place = bands[0].tod, self.data.scene, f"{self.step.label}, {bands[0].path}"
+        tod = bands[0].tod
+        scene = self.data.scene
+        place = f"{self.step.label}, {bands[0].path}"
         start = Instant.parse(tod.start)
         plane = joined([b.camera for b in bands], place).focalplane()
         if (np.diff(tod.seconds) <= 0).any():
@@ -300,9 +306,12 @@ class _Scans:
         """
         if len(bands) > 1:
             name = name.removesuffix(f"-{bands[0].camera.band.name}")
-        taken, number, found = {o.name for o in self.data.observations}, 2, name
+        taken = {o.name for o in self.data.observations}
+        number = 2
+        found = name
         while found in taken:
-            found, number = f"{name}.{number}", number + 1
+            found = f"{name}.{number}"
+            number = number + 1
         return found
 
 
@@ -319,7 +328,8 @@ def boresights(
 
     Raises InputError where those that are asked for cannot be had.
     """
-    azel, radec = tod.boresight_azel, tod.boresight_radec
+    azel = tod.boresight_azel
+    radec = tod.boresight_radec
     for name, values in (("boresight_azel", azel), ("boresight_radec", radec)):
         far = np.flatnonzero(np.abs(np.einsum("ij,ij->i", values, values) - 1) > 1e-6)
         if far.size:
@@ -371,7 +381,8 @@ def _check_same_scan(first: RecordedBand, part: RecordedBand, place: str) -> Non
         ("sample rate", lambda tod: tod.sample_rate, SAME_NUMBER),
     )
     for what, of, tolerance in stated:
-        one, own = np.array(of(first.tod)), np.array(of(part.tod))
+        one = np.array(of(first.tod))
+        own = np.array(of(part.tod))
         if one.shape != own.shape or not np.allclose(one, own, tolerance, SAME_DIRECTION):
             text = f"states another {what} than {first.path.name}, which has the same times"
             text += f": {own}, not {one}" if own.size <= 3 else ""
@@ -381,7 +392,8 @@ def _check_same_scan(first: RecordedBand, part: RecordedBand, place: str) -> Non
 
 def _tell(label: str, observation: Observation, file: File) -> None:
     """State what an observation of one band has of its file, and what is left out of it."""
-    good, dead = flags.good(file.flags, flags.EXCLUDE_SAMPLE), observation.detector_flags != 0
+    good = flags.good(file.flags, flags.EXCLUDE_SAMPLE)
+    dead = observation.detector_flags != 0
     observation.log.state(label, "noise of the detectors", file.noise)
     observation.log.count(
         label,

@@ -65,7 +65,8 @@ def noise_of(
     """
     file = reader(path)
     try:
-        tod, place = file.tod, f"zonda noise, {path}"
+        tod = file.tod
+        place = f"zonda noise, {path}"
         if signal not in file.streams:
             have = ", ".join(sorted(file.streams)) or "none"
             raise InputError(
@@ -104,7 +105,8 @@ def noise_of(
 
 def _mean(stream: RecordedStream, n_detectors: int, n_samples: int) -> Floats:
     """(n_samp,) mean over the detectors, of those that are finite."""
-    total, number = np.zeros(n_samples), np.zeros(n_samples)
+    total = np.zeros(n_samples)
+    number = np.zeros(n_samples)
     for rows in chunks(n_detectors, TILE_DETECTORS):
         for samples in chunks(n_samples, AT_ONCE):
             values, _ = stream.read(rows, samples)

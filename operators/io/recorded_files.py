@@ -76,7 +76,8 @@ class File:
     @classmethod
     def of(cls, band: RecordedBand, mask: int) -> File:
         """``mask``: bits of the flags that exclude a sample."""
-        tod, rows = band.tod, {band.tod.names[row]: row for row in band.rows.tolist()}
+        tod = band.tod
+        rows = {band.tod.names[row]: row for row in band.rows.tolist()}
         every = {"scanning": intervals_of(np.ones(tod.n_samples, bool), tod.seconds)}
         said = tod.sample_flags(mask), tod.scan_intervals or every, tod.weather, tod.hwp_angle
         return cls(band.path, rows, *said, band.noise)
@@ -209,10 +210,8 @@ class RecordedFiles(Operator):
         opened = reader(file.path)
         try:
             rows = np.array([file.rows[name] for name in observation.focalplane.names], np.intp)
-            good, usable = (
-                flags.good(file.flags, flags.EXCLUDE_SAMPLE),
-                flags.has_a_signal(file.flags),
-            )
+            good = flags.good(file.flags, flags.EXCLUDE_SAMPLE)
+            usable = flags.has_a_signal(file.flags)
             return RecordedStream(
                 opened,
                 self.signal,
@@ -289,7 +288,8 @@ class RecordedFiles(Operator):
         """Columns with the noise of the table, for the detectors ``rows``, of a model of the file
         or the file's own, and which of these it is in words.
         """
-        columns, said = dict(tod.columns), "the file's"
+        columns = dict(tod.columns)
+        said = "the file's"
         if self.noise_model is not None or "net" not in columns:
             said = "the scene's instrument's, or none: the file states none"
             try:

@@ -165,7 +165,8 @@ def joined(cameras: Sequence[RecordedInstrument], place: str) -> RecordedInstrum
     if len(cameras) == 1:
         return cameras[0]
     cameras = sorted(cameras, key=lambda camera: camera.band.centre)
-    first, bands = cameras[0], []
+    first = cameras[0]
+    bands = []
     for camera in cameras:
         own = {
             key: value
@@ -244,7 +245,8 @@ def instrument_of(
     diameter = 1.22 * LIGHT / band.centre / usual["fwhm"]
     if given is not None:
         diameter = given.telescope.diameter
-    name, about = tod.telescope or "recorded", tod.metadata
+    name = tod.telescope or "recorded"
+    about = tod.metadata
     made = RecordedInstrument(
         name=name,
         description=f"as {tod.name} was recorded",

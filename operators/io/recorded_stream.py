@@ -93,7 +93,8 @@ class RecordedStream:
         spoilt = 0
         for rows in chunks(detectors.stop - detectors.start, TILE_DETECTORS):
             for part in chunks(samples.stop - samples.start, AT_ONCE):
-                first, begin = detectors.start + rows.start, samples.start + part.start
+                first = detectors.start + rows.start
+                begin = samples.start + part.start
                 absolute = (
                     slice(first, detectors.start + rows.stop),
                     slice(begin, samples.start + part.stop),
@@ -139,7 +140,8 @@ class RecordedStream:
             & (True if self.good is None else self.good[samples])
         )
         for row, column in np.argwhere(large)[:1]:
-            name, sample = self.file.tod.names[rows[row]], samples.start + column
+            name = self.file.tod.names[rows[row]]
+            sample = samples.start + column
             cure = (
                 "the data are damaged: copy or make the file again; or flag the detector or the"
                 " samples"

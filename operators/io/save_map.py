@@ -72,7 +72,8 @@ class SaveMap(MapOutput):
                 place=self.label,
                 cure="add a step that makes one, e.g. BinMap",
             )
-        planes, runs = maps_of(data.products), data.provenance.get("runs")
+        planes = maps_of(data.products)
+        runs = data.provenance.get("runs")
         files = {
             product_path(folder, name, ".fits"): MapFile.of(
                 name,

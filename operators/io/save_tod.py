@@ -98,7 +98,8 @@ class SaveTOD(StreamOutput):
             else f"tod_{self.label}_{observation.name}"
         )
         path = product_path(output_folder(observation, self.label), stem, module.SUFFIX)
-        tod, streams = TimeOrderedData.of(observation), list(dict.fromkeys(self.streams))
+        tod = TimeOrderedData.of(observation)
+        streams = list(dict.fromkeys(self.streams))
         with ExitStack() as whole:
             temporary = whole.enter_context(atomic_path(path))
             return _State(path, module.Writer(temporary, tod, streams, self.dtype), whole.pop_all())
@@ -182,8 +183,10 @@ def load_tod(path: AnyPath) -> TimeOrderedData:
         When it cannot be read as such.
     """
     opened = reader(path, whole=True)
-    tod, place = opened.tod, opened.place
-    every, samples = np.arange(tod.n_detectors), slice(0, tod.n_samples)
+    tod = opened.tod
+    place = opened.place
+    every = np.arange(tod.n_detectors)
+    samples = slice(0, tod.n_samples)
     try:
         spoilt: Any = opened.flags(every, samples)
         if spoilt is not None:

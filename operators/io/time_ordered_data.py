@@ -166,7 +166,8 @@ class TimeOrderedData:
         limits, shapes do not fit each other, or times and pointing are not finite.
         """
         self._check_statements(place)
-        n, d = np.shape(self.times)[:1], np.shape(self.names)
+        n = np.shape(self.times)[:1]
+        d = np.shape(self.names)
         given = vars(self) | self.columns
         pointed = [name for name in ("boresight_azel", "boresight_radec") if len(given[name])]
         shapes = dict.fromkeys(("seconds", "times", "flags", "hwp_angle", "azimuth"), n)
@@ -305,7 +306,9 @@ class TimeOrderedData:
     @classmethod
     def of(cls, observation: Observation) -> TimeOrderedData:
         """Everything but the streams of an observation."""
-        o, f, instrument = observation, observation.focalplane, observation.instrument
+        o = observation
+        f = observation.focalplane
+        instrument = observation.instrument
         own = {
             "band_centre": np.full(len(f), instrument.band.centre),
             "band_width": np.full(len(f), instrument.band.width),
@@ -358,7 +361,8 @@ class TodWriter:
     """
 
     def __init__(self, path: Path, tod: TimeOrderedData) -> None:
-        self.path, self.tod = path, tod
+        self.path = path
+        self.tod = tod
 
     def write(self, stream: str, detectors: slice, samples: slice, values: AnyFloats) -> None:
         """Write a rectangle of a stream."""

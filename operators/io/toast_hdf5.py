@@ -250,7 +250,8 @@ def nominal_noise(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats] | None:
 
     In TOAST's two-sided convention: NET^2 (1 + (knee / max(f, f_min))^slope).
     """
-    c, rate = tod.columns, tod.sample_rate
+    c = tod.columns
+    rate = tod.sample_rate
     if not {"net", "knee", "slope", "minimum_frequency"} <= set(c) or not (c["net"] > 0).all():
         return None
     lowest = min(1e-5, rate / max(2 * tod.n_samples, 1))
@@ -260,7 +261,8 @@ def nominal_noise(tod: TimeOrderedData) -> tuple[AnyFloats, AnyFloats] | None:
 
 
 def _write_noise(group: Any, tod: TimeOrderedData, frequency: AnyFloats, psd: AnyFloats) -> None:
-    c, rate = tod.columns, tod.sample_rate
+    c = tod.columns
+    rate = tod.sample_rate
     names = [d.encode() for d in tod.names]
     width = max(len(d) for d in names) + 1
     group.attrs["class"] = "toast.noise.Noise"
@@ -382,10 +384,8 @@ class Reader:
                 cure=cure,
             )
         with self._reading():
-            group, unused = (
-                self._file["metadata"][model or DEFAULT_MODEL],
-                (self.tod.detector_flags & np.uint8(mask)) != 0,
-            )
+            group = self._file["metadata"][model or DEFAULT_MODEL]
+            unused = (self.tod.detector_flags & np.uint8(mask)) != 0
             return columns_of_model(group, self.tod.names, unused, self.place)
 
     def close(self) -> None:
@@ -439,7 +439,8 @@ def _rectangle(item: Any, rows: Indices, samples: slice) -> Any:
     """Rows and samples of a data set, or of a group that holds a FLAC-compressed one."""
     import h5py
 
-    first, last = int(rows[0]), int(rows[-1]) + 1
+    first = int(rows[0])
+    last = int(rows[-1]) + 1
     wanted = (
         slice(first, last)
         if last - first == len(rows) and (np.diff(rows) == 1).all()
@@ -469,7 +470,8 @@ def _read(file: Any, place: str) -> TimeOrderedData:
     """Read everything but the streams."""
     import astropy.units as u
 
-    instrument, shared = file["instrument"], file["shared"]
+    instrument = file["instrument"]
+    shared = file["shared"]
     spans = file.get("intervals", {})
     for dataset in (*shared.values(), *spans.values()):
         check_size(dataset, place)

@@ -55,7 +55,8 @@ def columns_of_model(
     mixed = defaultdict[str, dict[str, float]](dict)
     for detector, key, weight in group["mixing_matrix"][:]:
         mixed[detector.decode()][key.decode()] = float(weight)
-    found, known = np.full((4, len(detectors)), np.nan), dict[bytes, Floats]()
+    found = np.full((4, len(detectors)), np.nan)
+    known = dict[bytes, Floats]()
     for number in np.flatnonzero(~unused).tolist():
         detector = detectors[number]
         parts = {key: weight for key, weight in mixed[detector].items() if weight != 0}

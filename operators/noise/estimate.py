@@ -129,9 +129,11 @@ def spectrum(
         length // 2,
         detrend=detrend,
     )
-    spoilt, begins = np.r_[0, np.cumsum(~good)], np.arange(power.shape[1]) * (length // 2)
+    spoilt = np.r_[0, np.cumsum(~good)]
+    begins = np.arange(power.shape[1]) * (length // 2)
     whole = spoilt[begins + length] == spoilt[begins]
-    frequency, power = np.asarray(found[1:], np.float64), power[1:, whole].T
+    frequency = np.asarray(found[1:], np.float64)
+    power = power[1:, whole].T
     if len(power) < FEWEST:
         return frequency, np.full(len(frequency), np.nan), 0
     level = power[:, power.shape[1] // 2 :].mean(axis=1)
@@ -153,8 +155,10 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
     )  # the line takes the lowest
     if not segments or not (power[use] > 0).all():
         return None
-    every, bins = frequency[use], _Bins.of(frequency[use])
-    f, p = bins.mean(every), bins.mean(power[use])
+    every = frequency[use]
+    bins = _Bins.of(frequency[use])
+    f = bins.mean(every)
+    p = bins.mean(power[use])
     covariance = bins.covariance() * (VARIANCE / segments)
     log_p = (
         np.log(p) + np.diag(covariance) / 2
@@ -184,14 +188,17 @@ def fit(frequency: Floats, power: Floats, segments: int) -> Noise | None:
         found = curve_fit(law, f, log_p, [start, red, slope], covariance, True, bounds=limits)
         tried.append((cost(law(f, *found[0])), *found))
     chi, (white, red, slope), errors = min(tried, key=lambda one: one[0])
-    level, variance = float(alike @ log_p / alike.sum()), float(1 / alike.sum())
+    level = float(alike @ log_p / alike.sum())
+    variance = float(1 / alike.sum())
     of_white = cost(np.full(len(f), level))
     inside = red - white < slope * math.log(f[-1] / middle)  # the knee is below the last frequency
     if of_white - chi < 6.0 or not inside:
         # Two more parameters do as much by chance in one of twenty cases.
-        net, chi = math.sqrt(math.exp(level) / 2), of_white / max(len(f) - 1, 1)
+        net = math.sqrt(math.exp(level) / 2)
+        chi = of_white / max(len(f) - 1, 1)
         return Noise(net, net * math.sqrt(variance) / 2, 0.0, float(f[0]), 1.0, 0.0, segments, chi)
-    net, knee = math.sqrt(math.exp(white) / 2), middle * math.exp((red - white) / slope)
+    net = math.sqrt(math.exp(white) / 2)
+    knee = middle * math.exp((red - white) / slope)
     gradient = np.array([-1.0, 1.0, -(red - white) / slope]) / slope  # of ln knee
     return Noise(
         net,

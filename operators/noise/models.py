@@ -133,8 +133,11 @@ class Amplitude:
         observation: Observation,
         factor: float | Floats = 1.0,
     ) -> None:
-        self.label, self.level, self.factor = label, level, factor
-        self._means, self._lock = dict(observation.smooth), threading.Lock()
+        self.label = label
+        self.level = level
+        self.factor = factor
+        self._means = dict(observation.smooth)
+        self._lock = threading.Lock()
         self._field: SmoothField | None = None
 
     def of(self, observation: Observation) -> SmoothField:

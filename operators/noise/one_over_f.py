@@ -61,7 +61,10 @@ Complexes = NDArray[np.complex128]
 TOLERANCE = 0.25
 """A fit whose PSD errs by more is refused."""
 
-_N_BAND, _N_NYQUIST, _N_BELOW, _N_CORNER = 200, 50, 12, 80
+_N_BAND = 200
+_N_NYQUIST = 50
+_N_BELOW = 12
+_N_CORNER = 80
 _BELOW, _FEW = 3e-3, 8
 """Weight of the level below f_min with `_FEW` poles or less; with more it takes less of the band's
 accuracy.
@@ -130,7 +133,8 @@ class PowerLawFilter:
     @property
     def pairs(self) -> Floats:
         """(M, 4): Re q, Im q, and the factors of Re s and Im s in y, of equation (3)."""
-        q, r = self.pair_poles, _residues(self.pair_poles, self.pair_zeros)
+        q = self.pair_poles
+        r = _residues(self.pair_poles, self.pair_zeros)
         return np.stack([q.real, q.imag, 2 * r.real, -2 * r.imag], axis=1)
 
     def response(self, frequency: ArrayLike) -> Floats:
@@ -297,7 +301,8 @@ def _fit(f_min: float, slope: float, n: int, ends: int, sharp: float = 0.0) -> P
             )
         if pairs:
             (radius, angle, turn), each = wide(x), squares(x)
-            r, both = radius[:, None], count / each
+            r = radius[:, None]
+            both = count / each
             blocks.append((both * (2 * r * np.cos(angle)[:, None] * sine + 2 * r**2)).T)
             blocks.append((both * (-2 * r * (np.sin(angle) * turn)[:, None] * sine)).T)
         blocks.append(np.ones((frequency.size, 1)))
@@ -311,7 +316,8 @@ def _fit(f_min: float, slope: float, n: int, ends: int, sharp: float = 0.0) -> P
     poles, zeros = np.sort(roots(found[:n])[0])[::-1], np.sort(roots(found[n : 2 * n])[0])[::-1]
     radius, angle, _ = wide(found)
     both = _of_squares(-radius * np.exp(1j * angle))
-    pair_poles, pair_zeros = both[:pairs], both[pairs:]
+    pair_poles = both[:pairs]
+    pair_zeros = both[pairs:]
     covariance = _state_covariance(poles, zeros, pair_poles, pair_zeros)
     tap = zeros - poles
     if pairs:
@@ -321,7 +327,9 @@ def _fit(f_min: float, slope: float, n: int, ends: int, sharp: float = 0.0) -> P
     if not (
         np.diag(covariance) > 0
     ).all():  # so far from the law that its states cannot be told apart
-        error, scale, covariance = np.inf, np.ones(len(covariance)), np.eye(len(covariance))
+        error = np.inf
+        scale = np.ones(len(covariance))
+        covariance = np.eye(len(covariance))
     value, vector = np.linalg.eigh(covariance / np.outer(scale, scale))
     gain = float(np.exp(found[-1]) * np.prod(np.abs(1 - pair_poles) / np.abs(1 - pair_zeros)) ** 2)
     return PowerLawFilter(
@@ -345,7 +353,8 @@ def _of_squares(root: Complexes) -> Complexes:
     """The distance q from 1 of the root in the unit circle whose q^2 + (1 - q) v is 0 at v =
     ``root``; Im q > 0.
     """
-    half, away = root / 2, np.sqrt(root * (root / 4 - 1))
+    half = root / 2
+    away = np.sqrt(root * (root / 4 - 1))
     q = np.where(np.abs(1 - half - away) < 1, half + away, half - away)
     return np.asarray(np.where(q.imag < 0, q.conj(), q), np.complex128)
 
@@ -358,23 +367,33 @@ def _least_squares(
     """Levenberg-Marquardt (Nielsen's damping, Madsen et al. 2004, algorithm 3.16): argmin
     |misfit|^2 from ``x``.
     """
-    f, j = misfit(x), jacobian(x)
-    matrix, slope, cost = j.T @ j, j.T @ f, f @ f
-    damping, raised = _DAMPING * matrix.diagonal().max(), 2.0
+    f = misfit(x)
+    j = jacobian(x)
+    matrix = j.T @ j
+    slope = j.T @ f
+    cost = f @ f
+    damping = _DAMPING * matrix.diagonal().max()
+    raised = 2.0
     for _ in range(_EVALUATIONS):
         step = np.linalg.solve(matrix + damping * np.eye(x.size), -slope)
         f = misfit(x + step)
-        gained, promised = cost - f @ f, step @ (damping * step - slope)
+        gained = cost - f @ f
+        promised = step @ (damping * step - slope)
         if gained > 0:
             x, j = x + step, jacobian(x + step)
-            matrix, slope, before, cost = j.T @ j, j.T @ f, cost, f @ f
-            damping, raised = damping * max(1 / 3, 1 - (2 * gained / promised - 1) ** 3), 2.0
+            matrix = j.T @ j
+            slope = j.T @ f
+            before = cost
+            cost = f @ f
+            damping = damping * max(1 / 3, 1 - (2 * gained / promised - 1) ** 3)
+            raised = 2.0
             if gained < _CHANGE * before:
                 break
         elif promised < _CHANGE * cost:
             break
         else:
-            damping, raised = damping * raised, 2 * raised
+            damping = damping * raised
+            raised = 2 * raised
     return x
 
 
@@ -415,7 +434,8 @@ def _state_covariance(
     S = (1 + D) S (1 + D)^T + b b^T. Written with D = A - 1, so that nothing cancels for slow poles.
     A pair counts as s and s*, which do not act on each other.
     """
-    n, more = poles.size, 0 if pair_poles is None else 2 * pair_poles.size
+    n = poles.size
+    more = 0 if pair_poles is None else 2 * pair_poles.size
     every: Any = poles
     tap: Any = zeros - poles
     if pair_poles is not None and pair_zeros is not None and more:

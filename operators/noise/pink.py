@@ -71,7 +71,8 @@ class PinkNoise(Operator):
         noise has.
         """
         for observation in data.observations[:1]:
-            spectrum, nyquist = PinkSpectrum.of(self, observation), observation.sampling[1] / 2
+            spectrum = PinkSpectrum.of(self, observation)
+            nyquist = observation.sampling[1] / 2
             text = (
                 "" if spectrum is None else doubt(f"{self.label}: knee", spectrum.knee, KNEE, "Hz")
             )
@@ -142,7 +143,8 @@ class _State(NamedTuple):
 
 def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation) -> _State:
     """Raises InputError as `PinkSpectrum.filters`."""
-    laws, slopes = spectrum.filters(pink), spectrum.different
+    laws = spectrum.filters(pink)
+    slopes = spectrum.different
     observation.log.state(
         pink.label,
         "power over that of white noise",
@@ -150,7 +152,8 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
     )
     resolve(observation)
     level = level_of(pink, observation)
-    net, good = level.sky_net(observation), observation.good_detectors
+    net = level.sky_net(observation)
+    good = observation.good_detectors
     spectrum.state(observation, net)
     squares = np.where(good, net**2, 0.0) / max(int(good.sum()), 1)
     observation.closed_forms.setdefault("pink", []).append(
@@ -158,7 +161,8 @@ def _prepared(pink: PinkNoise, spectrum: PinkSpectrum, observation: Observation)
     )
     gain = np.sqrt([laws[slope].gain for slope in spectrum.slopes.tolist()])
     amplitude = Amplitude(pink.label, level, observation, spectrum.factors * gain)
-    key, start = observation.detector_key(pink.label), observation.detector_key(pink.label, "start")
+    key = observation.detector_key(pink.label)
+    start = observation.detector_key(pink.label, "start")
     made = {slope: Streams(laws[slope], key, start) for slope in slopes}
     streams = made[slopes[0]] if len(made) == 1 else StreamsOfSlopes(spectrum.slopes, made)
     common = np.zeros((len(made), observation.n_samples if pink.shared else 0), np.float32)
@@ -193,15 +197,18 @@ class PinkSpectrum:
     @classmethod
     def of(cls, pink: PinkNoise, observation: Observation) -> PinkSpectrum | None:
         """Spectrum of an observation; None: no pink noise."""
-        instrument, n = observation.instrument, observation.n_detectors
+        instrument = observation.instrument
+        n = observation.n_detectors
         knee = instrument.knee if pink.knee is None else pink.knee
         plane = instrument.focalplane() if pink.knee is None or pink.slope is None else None
         if plane and pink.knee is None and not knee:  # the median; single detectors may have some
             knee = float(plane.knee.max())
         if not knee:
             return None
-        slope, minimum = pink.slope or instrument.slope, pink.minimum_frequency
-        knees, slopes = np.full(n, knee), np.full(n, slope)
+        slope = pink.slope or instrument.slope
+        minimum = pink.minimum_frequency
+        knees = np.full(n, knee)
+        slopes = np.full(n, slope)
         if plane and plane.names == observation.focalplane.names:
             if pink.knee is None and np.ptp(plane.knee):
                 knees = plane.knee

@@ -66,7 +66,9 @@ class Streams:
         key: Key,
         start_key: Key,
     ) -> None:
-        self.law, self.key, self.start_key = law, key, start_key
+        self.law = law
+        self.key = key
+        self.start_key = start_key
         padding = (
             -law.poles.size % 4
         )  # the kernel takes sections four at a time; a section with z = q passes its input on
@@ -127,12 +129,15 @@ class Streams:
         with tile.lock:
             nearest = max(k for k in tile.kept if k <= sample)
             state = tile.kept[nearest].copy()
-            law, stop = (self._rate, self._tap, self._pairs), sample + out.shape[1]
+            law = (self._rate, self._tap, self._pairs)
+            stop = sample + out.shape[1]
             pieces = [(nearest, sample), (sample, stop)]
             for begin, end in (p for piece in pieces for p in _pieces(*piece, CHECKPOINT)):
-                part, rows = slice(begin - sample, end - sample), out
+                part = slice(begin - sample, end - sample)
+                rows = out
                 if begin < sample:  # on the way there
-                    part, rows = slice(0, 0), out[:0]
+                    part = slice(0, 0)
+                    rows = out[:0]
                 these = common[part], shares, over, rows[:, part]
                 _filter(self.key, number, begin, end - begin, state, *law, lane, *level, *these)
                 self._keep(tile, end, state)
@@ -143,7 +148,8 @@ class Streams:
         tile.kept[sample], tile.last = state.copy(), sample
 
     def _first_state(self, number: int) -> NDArray[np.float32]:
-        n, sections = len(self.law.start), self.law.poles.size
+        n = len(self.law.start)
+        sections = self.law.poles.size
         deviates = normals(self.start_key, 0, n * TILE_DETECTORS, stream=number).reshape(
             n,
             TILE_DETECTORS,
@@ -166,7 +172,8 @@ class StreamsOfSlopes:
     """
 
     def __init__(self, slopes: Floats, made: Mapping[float, Streams]) -> None:
-        self._slopes, self._made = slopes, made
+        self._slopes = slopes
+        self._made = made
         self.variance = np.array([made[slope].variance for slope in slopes.tolist()])
 
     def add(

@@ -117,17 +117,18 @@ class Efficiency(Operator):
         observation.log.count(self.label, "detectors whose scattered zeta was clipped", clipped)
 
     def _coefficients(self, observation: Observation) -> Calibration:
-        zeta, epsilon = (
-            observation.focalplane.main_beam_efficiency,
-            observation.focalplane.illumination_efficiency,
-        )
-        gain, transmission, mean = np.ones(len(zeta)), observation.smooth.get("transmission"), None
+        zeta = observation.focalplane.main_beam_efficiency
+        epsilon = observation.focalplane.illumination_efficiency
+        gain = np.ones(len(zeta))
+        transmission = observation.smooth.get("transmission")
+        mean = None
         if self.calibration_error > 0:
             gain += self.calibration_error * _normals(observation, self.label, "gain")
         if transmission is not None:
             _flag_opaque(self.label, observation, transmission)
         if (ratio := observation.smooth.get("atmosphere")) is not None:
-            share, error = gain * epsilon / zeta, 0.0
+            share = gain * epsilon / zeta
+            error = 0.0
             if transmission is not None:
                 ratio, error = field_ratio(
                     ratio,
@@ -157,7 +158,8 @@ def _make_signal(block: Block, state: Calibration, instantaneous: bool) -> int:
     """Put the signal and its mean into a block. Returns how many samples of 1 + x were raised to
     `LEAST_TRANSMISSION`.
     """
-    have, signal = block.detdata, block.buffer("signal", block.shape)
+    have = block.detdata
+    signal = block.buffer("signal", block.shape)
     absent = np.empty((0, 0), block.dtype)
     divisor = level = Series(absent, 0, np.ones(1, block.dtype))
     mean = None if block.components and "atmosphere" not in block.components else state.mean
@@ -303,7 +305,8 @@ def _flag_opaque(label: str, observation: Observation, transmission: SmoothField
     is.
     """
     knots = knots_of(transmission, transmission.step)
-    dead, cell = np.zeros(len(transmission.weights), bool), np.zeros(knots.shape[1], bool)
+    dead = np.zeros(len(transmission.weights), bool)
+    cell = np.zeros(knots.shape[1], bool)
     for rows in chunks(len(dead), AT_ONCE):
         opaque = ~(transmission.weights[rows] @ knots >= LEAST_TRANSMISSION)
         dead[rows] = opaque.mean(axis=1) > 0.5

@@ -71,10 +71,8 @@ def _representatives(weights: AnyFloats, use: Indices) -> Indices:
     n = len(weights)
     if n <= 512:
         return np.arange(n)
-    evenly, used = (
-        np.linspace(0, n - 1, 256),
-        use[np.linspace(0, len(use) - 1, min(len(use), 64)).astype(np.intp)],
-    )
+    evenly = np.linspace(0, n - 1, 256)
+    used = use[np.linspace(0, len(use) - 1, min(len(use), 64)).astype(np.intp)]
     return np.unique(
         np.r_[evenly.astype(np.intp), weights.argmin(axis=0), weights.argmax(axis=0), used]
     )
@@ -84,14 +82,13 @@ def _ratio(above: SmoothField, below: SmoothField, step: int, rows: Indices) -> 
     """The ratio for the detectors ``rows`` at the coarse times; in the first and last column,
     its slopes at the ends.
     """
-    one, other, high, low = (
-        above.weights[rows],
-        below.weights[rows],
-        knots_of(above, step),
-        knots_of(below, step),
-    )
+    one = above.weights[rows]
+    other = below.weights[rows]
+    high = knots_of(above, step)
+    low = knots_of(below, step)
     found = empty((len(rows), low.shape[1] + 2))
-    ratio, ends = found[:, 1:-1], [0, -1]
+    ratio = found[:, 1:-1]
+    ends = [0, -1]
     for part in chunks(low.shape[1]):
         np.divide(
             one @ high[:, part],
@@ -167,7 +164,9 @@ def _spline(known: Floats) -> Floats:
     knots: c_j = A z^j + B z^(m - j), z = sqrt(3) - 2, solves c_(j-1) + 4 c_j + c_(j+1) = 0 for
     knots 0 .. m, with (c_1 - c_-1) / 2 = sqrt(3) (A - z^m B).
     """
-    first, last, m = known[:, :1], known[:, -1:], known.shape[1] - 3
+    first = known[:, :1]
+    last = known[:, -1:]
+    m = known.shape[1] - 3
     z = math.sqrt(3) - 2
     far = z**m
     a, b = (

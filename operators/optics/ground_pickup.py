@@ -90,7 +90,8 @@ def horizon(azimuth: Floats, fwhm: float, key: Key) -> Floats:
     power = np.exp(-((waves * s) ** 2))
     power /= power.sum()
     a, b = normals(key, 0, 2 * len(waves)).astype(np.float64).reshape(2, -1) * np.sqrt(power)
-    turn, found = np.exp(1j * azimuth), np.zeros(len(azimuth))
+    turn = np.exp(1j * azimuth)
+    found = np.zeros(len(azimuth))
     wave = np.ones(len(azimuth), np.complex128)
     for c, d in zip(a, b, strict=True):
         wave *= turn

@@ -42,7 +42,8 @@ class Leakage(Operator):
         """p l exp(-2 i (beta - gamma)) of each detector, or with a plate p l exp(-2 i (beta +
         gamma)) and 4 chi.
         """
-        plane, chi = observation.focalplane, observation.hwp_angle
+        plane = observation.focalplane
+        chi = observation.hwp_angle
         turn = (
             self.angle - plane.polarization_angle
             if chi is None
@@ -58,7 +59,8 @@ class Leakage(Operator):
     def exec(self, block: Block, state: tuple[Floats, Floats]) -> None:
         """Equation (1): a gain of each detector, which the plate modulates."""
         (cosine, sine), turn = state
-        cosine, sine = cosine[block.detectors, None], sine[block.detectors, None]
+        cosine = cosine[block.detectors, None]
+        sine = sine[block.detectors, None]
         if turn.size:
             plate = turn[block.samples]
             cosine = cosine * np.cos(plate) + sine * np.sin(plate)

@@ -106,7 +106,9 @@ class Scans(Operator):
         """A selection of scans and instants: elevation, speed and acceleration, samples per beam,
         distances from Sun and Moon.
         """
-        rate, first, scans = self._rate(data), len(data.observations), self.every()
+        rate = self._rate(data)
+        first = len(data.observations)
+        scans = self.every()
         looked = self.some(scans)
         lengths = [self.length(scan) for scan in looked]
         self._observe(
@@ -137,8 +139,10 @@ class Scans(Operator):
 
     def _observe(self, data: Data, scans: Sequence[Any], rate: float) -> None:
         """Append observations of scans, sampled at ``rate`` [Hz]."""
-        make, before = self.maker(data), len(data.observations)
-        moved, sampled = LargestMotion(data.scene.instrument.telescope), SamplesPerBeam()
+        make = self.maker(data)
+        before = len(data.observations)
+        moved = LargestMotion(data.scene.instrument.telescope)
+        sampled = SamplesPerBeam()
         for scan in scans:
             observation = make(scan, rate, moved)
             sampled.add(observation, self._rate(data))
@@ -234,7 +238,8 @@ class Pointing(Scans):
         """Horizontal unit vectors (n, 3) north, west, up at ``seconds`` (n,) since the start of the
         scan.
         """
-        target, offset = aim.target, aim.offset
+        target = aim.target
+        offset = aim.offset
         found = series(3, len(seconds))
         for chunk in chunks(len(seconds)):
             if target.frame == "horizontal":
@@ -283,7 +288,8 @@ class Pointing(Scans):
         return range(self.number)
 
     def some(self, scans: Sequence[int]) -> list[int]:
-        last, most = len(scans) - 1, min(len(scans), SCANS_LOOKED_AT)
+        last = len(scans) - 1
+        most = min(len(scans), SCANS_LOOKED_AT)
         return sorted({round(k) for k in np.linspace(0, last, most)})
 
     def length(self, scan: int) -> float:
@@ -319,14 +325,16 @@ class Pointing(Scans):
                 place=self.label,
                 cure="give the scene or this operator a target, e.g. 05h00m00s +20d00m00s",
             )
-        begin, before = scene.time, data.n_scans
+        begin = scene.time
+        before = data.n_scans
         if data.observations:
             last = data.observations[-1]
             begin = last.start.shifted(last.duration + self.gap)
 
         def make(k: int, rate: float, moved: LargestMotion) -> Observation:
             start = begin.shifted(k * (self.scan_duration + self.gap))
-            scan, target = self.of_scan(k, scene.instrument), targets[k // self.scans]
+            scan = self.of_scan(k, scene.instrument)
+            target = targets[k // self.scans]
             return scan._scan(data, target, start, before + k, self._offset(k), rate, moved)
 
         return make
@@ -345,7 +353,8 @@ class Pointing(Scans):
         moved: LargestMotion,
     ) -> Observation:
         """The observation ``index``, sampled at ``rate`` [Hz]."""
-        scene, telescope = data.scene, data.scene.instrument.telescope
+        scene = data.scene
+        telescope = data.scene.instrument.telescope
         n = max(round(self.scan_duration * rate), 1)
         seconds = self._seconds(n, rate, self._jitter_key(data, index))
         transform = transform_of(scene, start, seconds[-1], self.interpolation_error)
@@ -413,7 +422,8 @@ class Pointing(Scans):
         """Compare the track with the telescope's limits; raise where it exceeds one that it must
         keep.
         """
-        rate, limits = observation.sample_rate, moved.limits
+        rate = observation.sample_rate
+        limits = moved.limits
         length = observation.n_samples / rate
 
         def track(scan: Pointing, step: float) -> Floats:

@@ -48,8 +48,10 @@ def check_elevation(
         return
     rows = int(horizontal[:, 2].argmin()), int(horizontal[:, 2].argmax())
     _, elevation = angles(horizontal[[*rows]])
-    low, high = telescope.elevation_min, telescope.elevation_max
-    under, over = low - elevation.min(), elevation.max() - high
+    low = telescope.elevation_min
+    high = telescope.elevation_max
+    under = low - elevation.min()
+    over = elevation.max() - high
     if max(under, over) > 1e-9:
         reached, way = (elevation.min(), "down") if under > over else (elevation.max(), "up")
         where = f"goes {way} to elevation {np.degrees(reached):.2f} deg{when(rows[way == 'up'])}"
@@ -68,10 +70,13 @@ def when_up(
 
     ``horizontal`` (n, 3): its directions. ``total`` [s]: how long all scans take.
     """
-    low, high = telescope.elevation_min, telescope.elevation_max
+    low = telescope.elevation_min
+    high = telescope.elevation_max
     if target.frame == "horizontal":
         return f"choose an elevation from {_range(low, high)}, with room for the scan"
-    centre, site, start = unit_vectors(*target.icrs()), transform.site, transform.start
+    centre = unit_vectors(*target.icrs())
+    site = transform.site
+    start = transform.start
     samples = evenly(len(horizontal), 1000)
     step = transform.duration / max(len(horizontal) - 1, 1)
     _, along = angles(transform.horizontal(centre, samples.astype(np.float64) * step))
@@ -190,7 +195,8 @@ class LargestMotion:
         for order in (1, 2):
             parts = []
             for axis in ("azimuth", "elevation", "sky"):
-                peak, limit = self._found.get((axis, order)), self.limits.get((axis, order))
+                peak = self._found.get((axis, order))
+                limit = self.limits.get((axis, order))
                 if peak is not None and (limit or axis != "sky"):
                     figure = peak.figure if peak.figure > STILL else 0.0
                     share = (

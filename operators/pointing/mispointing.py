@@ -60,7 +60,8 @@ class Mispointing(Operator):
             turned = observation.derotate("boresight_azel")[
                 2
             ]  # of the focal plane: xi is not along the azimuth then
-            cosine, sine = np.cos(turned), np.sin(turned)
+            cosine = np.cos(turned)
+            sine = np.sin(turned)
             observation.pointed_radec = beside(
                 observation.sky_boresight,
                 x * cosine - y * sine,
@@ -72,7 +73,8 @@ class Mispointing(Operator):
 
     def errors(self, observation: Observation) -> tuple[Floats, Floats]:
         """(x, y), (n_samp,) each, rad."""
-        key, n = observation.key(self.label), observation.n_samples
+        key = observation.key(self.label)
+        n = observation.n_samples
         whole = self.scan_rms * normals(key, 0, 2, stream=0).astype(np.float64)
         offset = self.offset or (0.0, 0.0)
         found = [np.full(n, offset[k] + whole[k]) for k in (0, 1)]

@@ -98,16 +98,15 @@ def motion(
             or len(horizontal) < 2
         ):
             return found
-        stride, step = stride // 2, step / 2
+        stride = stride // 2
+        step = step / 2
 
 
 def _peaks(track: Floats, step: float) -> dict[Quantity, LargestDerivative]:
     azimuth = np.unwrap(np.arctan2(-track[:, 1], track[:, 0]))
     elevation = np.arctan2(track[:, 2], np.hypot(track[:, 0], track[:, 1]))
-    fine, coarse = (
-        _derivatives(azimuth, elevation, 1, step),
-        _derivatives(azimuth, elevation, 2, step),
-    )
+    fine = _derivatives(azimuth, elevation, 1, step)
+    coarse = _derivatives(azimuth, elevation, 2, step)
     found = {}
     for (axis, order), rates in fine.items():
         k = int(rates.argmax())
@@ -132,7 +131,8 @@ def _derivatives(
     """Magnitudes of difference quotients over ``lag`` steps, (n - order lag,) each; without those
     of no points.
     """
-    axes, found = {"azimuth": azimuth, "elevation": elevation}, {}
+    axes = {"azimuth": azimuth, "elevation": elevation}
+    found = {}
     for order in (1, 2, 3):
         axes = {axis: values[lag:] - values[:-lag] for axis, values in axes.items()}
         per = (lag * step) ** order
@@ -170,7 +170,11 @@ class SamplesPerBeam:
     """How its statement begins."""
 
     def __init__(self) -> None:
-        self._fastest, self._usual, self._fwhm, self._rate, self._where = 0.0, 0.0, 0.0, 0.0, ""
+        self._fastest = 0.0
+        self._usual = 0.0
+        self._fwhm = 0.0
+        self._rate = 0.0
+        self._where = ""
 
     def add(self, observation: Observation, rate: float) -> None:
         """Take a scan into account, read out at ``rate`` [Hz]."""
@@ -181,12 +185,11 @@ class SamplesPerBeam:
         )
         total = speed + turn * math.atan(observation.focalplane.radius)
         if len(total) and total.max() > self._fastest:
-            self._fastest, self._usual = float(total.max()), float(np.median(total))
-            self._fwhm, self._rate, self._where = (
-                float(observation.focalplane.fwhm.min()),
-                rate,
-                observation.name,
-            )
+            self._fastest = float(total.max())
+            self._usual = float(np.median(total))
+            self._fwhm = float(observation.focalplane.fwhm.min())
+            self._rate = rate
+            self._where = observation.name
 
     @property
     def least(self) -> float:

@@ -56,7 +56,8 @@ def sunlit(
     """
     nodes = np.linspace(seconds[0], seconds[-1], int((seconds[-1] - seconds[0]) // SPACING) + 2)
     (sun,) = tracks(site, start.posix + nodes, "sun")
-    near, above = np.zeros(len(seconds), bool), np.zeros(len(seconds), bool)
+    near = np.zeros(len(seconds), bool)
+    above = np.zeros(len(seconds), bool)
     for part in chunks(len(seconds)):
         towards = np.stack(
             [np.interp(seconds[part], nodes, one) for one in sun.direction.T],
@@ -93,19 +94,22 @@ def distances(observations: Sequence[Observation]) -> list[str]:
     up.
     """
     each = max(LOOKED_AT // max(len(observations), 1), 3)
-    times, directions = [], []
+    times = []
+    directions = []
     for o in observations:
         at = np.unique(np.linspace(0, o.n_samples - 1, min(each, o.n_samples)).astype(int))
         times.append(o.start.posix + o.seconds[at])
         directions.append(looking(o.boresight_azel[at]))
-    when, track = np.concatenate(times), Track(np.concatenate(directions))
+    when = np.concatenate(times)
+    track = Track(np.concatenate(directions))
     lines = []
     for name, body in zip(
         ("Sun", "Moon"),
         tracks(observations[0].site, when, "sun", "moon"),
         strict=True,
     ):
-        apart, up = np.degrees(track.distance(body)), body.elevation > math.radians(-0.5)
+        apart = np.degrees(track.distance(body))
+        up = body.elevation > math.radians(-0.5)
         where = "up" if up.all() else "up part of the time" if up.any() else "below the horizon"
         lines.append(f"distance of the {name}: {apart.min():.1f} to {apart.max():.1f} deg, {where}")
     return lines
@@ -199,7 +203,9 @@ def state_times(label: str, observation: Observation) -> None:
     samples.
     """
     late = observation.departures
-    rms, most, rate = observation.jitter, float(abs(late).max()), observation.sample_rate
+    rms = observation.jitter
+    most = float(abs(late).max())
+    rate = observation.sample_rate
     step = np.diff(observation.seconds) * rate
     at_nyquist = math.pi * rate * rms
     observation.log.state(

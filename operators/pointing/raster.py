@@ -83,7 +83,8 @@ class Rows(Sweep):
         """T of equation (3), s."""
         b, c = (4.0, 2 * math.pi) if self.smooth else (2.0, 4.0)
         step = self.spacing if self.n > 1 else 0.0
-        along, across = (b * self.speed) ** 2, 2 * self.acceleration * c * step
+        along = (b * self.speed) ** 2
+        across = 2 * self.acceleration * c * step
         needed = math.sqrt((along + math.hypot(along, across)) / 2) / self.acceleration
         return max(needed, 2 * step / self.speed)
 
@@ -106,7 +107,8 @@ class Rows(Sweep):
         step = np.where(u < 0.5, 2 * u * u, 1 - 2 * (1 - u) ** 2)
         if self.smooth:
             step = u - np.sin(2 * np.pi * u) / (2 * np.pi)
-        now, then = self.row(number), self.row(number + 1)
+        now = self.row(number)
+        then = self.row(number + 1)
         y = (now + (then - now) * step - (self.n - 1) / 2) * self.spacing
         return self.path(seconds), np.asarray(y)
 
@@ -160,7 +162,8 @@ class RasterParameters(Pointing):
         The coverage of a disc of diameter D along rows s apart ripples by 4 J_1(pi D / s) / (pi D /
         s), relative: 5 % at s = D / 4.
         """
-        telescope, beam = instrument.telescope, instrument.beam_fwhm
+        telescope = instrument.telescope
+        beam = instrument.beam_fwhm
 
         def otherwise(name: str, *values: float) -> float:
             """The parameter, or the least of the values and `SHARE` of the telescope's limits."""
@@ -207,12 +210,14 @@ class PointingRaster(RasterParameters):
             float(value or 0.0)
             for value in (self.width, self.height, self.spacing, self.speed, self.acceleration)
         )
-        n, smooth = math.floor(height / spacing + 1e-9) + 1, bool(self.smooth)
+        n = math.floor(height / spacing + 1e-9) + 1
+        smooth = bool(self.smooth)
         return Rows(width, speed, acceleration, smooth, -width / 2, spacing, n)
 
     def path(self, seconds: Floats) -> tuple[Floats, Floats]:
         along, across = self.rows.offsets(seconds)
-        sine, cosine = math.sin(self.position_angle), math.cos(self.position_angle)
+        sine = math.sin(self.position_angle)
+        cosine = math.cos(self.position_angle)
         return along * sine - across * cosine, along * cosine + across * sine
 
     def boresight(self, aim: Aim, seconds: Floats) -> Boresight:
@@ -238,7 +243,8 @@ class PointingRaster(RasterParameters):
         }
 
     def check(self, data: Data) -> list[str]:
-        first, lines = len(data.observations), super().check(data)
+        first = len(data.observations)
+        lines = super().check(data)
         return [
             *lines,
             *(
@@ -276,7 +282,8 @@ def _doubts(rows: Rows, duration: float, interval: float) -> list[str]:
             " a width"
         )
     if duration < rows.pass_time - interval:
-        took, lasts = f"{rows.pass_time:.4g} s", f"scan_duration is {duration:.4g} s"
+        took = f"{rows.pass_time:.4g} s"
+        lasts = f"scan_duration is {duration:.4g} s"
         found.append(f" ends before all {rows.n} rows are crossed: they take {took}, {lasts}")
     return found
 

@@ -184,7 +184,8 @@ def _on_the_sky(recording: Recording, celestial: str | None, place: str) -> Reco
 
 def _doubts(recording: Recording, found: Comb, time: Instant, file: Path) -> list[str]:
     """Warnings of a run: a record of another day than the scene's, rows out of order."""
-    texts, start = [], recording.start or time
+    texts = []
+    start = recording.start or time
     if abs(time.seconds_since(start)) > ANOTHER_DAY:
         texts.append(
             f"the record begins {start}, the weather is that of {time}: set the scene's time"

@@ -108,7 +108,8 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
         Fewer than two usable rows, or intervals so uneven (`UNEVEN`) that there is no comb.
     """
     counts = dict[str, int]()
-    seconds, rows = recording.seconds, np.flatnonzero(np.isfinite(recording.seconds))
+    seconds = recording.seconds
+    rows = np.flatnonzero(np.isfinite(recording.seconds))
 
     def keep(what: str, chosen: NDArray[Any]) -> None:
         nonlocal rows
@@ -142,7 +143,8 @@ def comb(recording: Recording, split: float, place: str) -> Comb:
     good = np.isfinite(recording.longitude[rows]) & np.isfinite(recording.latitude[rows])
     if recording.radec is not None:
         good &= np.isfinite(recording.radec[rows]).all(axis=1)
-    scans, alone = [], 0
+    scans = []
+    alone = 0
     for part in np.split(np.arange(len(rows)), np.flatnonzero(~near) + 1):
         if np.count_nonzero(good[part]) < 2:
             alone += len(part)

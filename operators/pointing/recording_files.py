@@ -290,7 +290,8 @@ def _check_rotation(quaternions: Any, place: str) -> None:
 
 
 def _recording(given: RecordedTable, clock: Clock, mask: int | None, place: str) -> Recording:
-    table, start = given.table, given.start
+    table = given.table
+    start = given.start
     found = {
         ours: name for ours, names in ALIASES.items() for name in names if name in table.columns
     }
@@ -412,7 +413,8 @@ def _times(times: Floats, clock: Clock, place: str) -> tuple[Floats, Instant | N
             place=place,
             cure="check the column of times",
         )
-    first, days = int(np.floor(finite[0])), clock == "mjd"
+    first = int(np.floor(finite[0]))
+    days = clock == "mjd"
     try:
         start = Instant((first - 40587) * 86400 * SECOND if days else first * SECOND)
         year = start.datetime.year

@@ -176,7 +176,8 @@ def _of_text(text: str, place: str) -> Table:
     """The table of a text schedule: a line about the site, then the fields of a row a line, between
     bars, commas, semicolons, tabs or blanks.
     """
-    lines, rows = [], []
+    lines = []
+    rows = []
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.startswith("#"):
             mark = max("|,;\t", key=line.count)
@@ -263,9 +264,11 @@ def _note_overlaps(rows: list[Row], nods: float, table: Table) -> None:
     telescope is in one place at a time."""
     sound = [k for k, row in enumerate(rows) if row.duration > 0]
     begins = {k: rows[k].start.seconds_since(rows[sound[0]].start) for k in sound}
-    before, stops = -1, -math.inf
+    before = -1
+    stops = -math.inf
     for k in sorted(sound, key=begins.__getitem__):
-        early, what = stops - begins[k], "begins"
+        early = stops - begins[k]
+        what = "begins"
         cure = "shift or shorten one of them, or remove one"
         if early <= OVERLAP + 1e-6 and nods:
             early += nods
@@ -275,7 +278,8 @@ def _note_overlaps(rows: list[Row], nods: float, table: Table) -> None:
             other = f"{rows[before].label} (line {table.lines[before]})"
             table.note(k, f"{rows[k].label}: {what} {early:.6g} s before {other} stops", cure)
         if begins[k] + rows[k].duration > stops:
-            before, stops = k, begins[k] + rows[k].duration
+            before = k
+            stops = begins[k] + rows[k].duration
 
 
 EARTH, NEAR, FAR = 6.371e6, 5e3, 1e5
@@ -425,7 +429,8 @@ class PointingSchedule(ScheduleParameters):
 
     def _observation(self, data: Data, row: Row, rate: float, moved: LargestMotion) -> Observation:
         """The observation of a row, sampled at ``rate`` [Hz]."""
-        scene, place = data.scene, f"{self.label}, {self.schedule}, {row.label}"
+        scene = data.scene
+        place = f"{self.label}, {self.schedule}, {row.label}"
         mount = self.speed / math.cos(row.elevation) if row.width else 0.0
         smooth = self.turnaround == "smooth"
         sweep = Sweep(row.width, mount, self.acceleration, smooth)
@@ -457,7 +462,8 @@ class PointingSchedule(ScheduleParameters):
         lit, suns = sunlit(scene.site, start, seconds, azel, self.sun_close)
         turned = np.array([[0, 0, math.sin(row.rotation / 2), math.cos(row.rotation / 2)]])
         if row.rotation:
-            azel, radec = multiply(azel, turned), multiply(radec, turned)
+            azel = multiply(azel, turned)
+            radec = multiply(radec, turned)
         scanning = seconds >= delay
         intervals = {
             name: [(a + delay, b + delay) for a, b in spans]

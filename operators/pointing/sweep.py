@@ -77,7 +77,8 @@ class Sweep:
         A throw goes from the middle of a turnaround to that of the next. A stare is one throw, in
         no direction.
         """
-        cycle, turning = self.leg + self.turnaround, self.turning(seconds)
+        cycle = self.leg + self.turnaround
+        turning = self.turning(seconds)
         first, throw = (
             np.floor(t / cycle) % 2 == 0 for t in (seconds, seconds + self.turnaround / 2)
         )
@@ -111,10 +112,13 @@ class Nod:
 
     def path(self, seconds: Floats) -> Floats:
         """Elevation (n,) above the first stop [rad] at ``seconds`` (n,); the last stop is kept."""
-        found, begin = np.zeros(len(seconds)), 0.0
+        found = np.zeros(len(seconds))
+        begin = 0.0
         for start, way, ramp, coast in self._moves():
-            u, v = np.clip(seconds - begin, 0.0, 2 * ramp + coast), self.acceleration * ramp
-            up, down = np.minimum(u, ramp), np.maximum(u - ramp - coast, 0.0)
+            u = np.clip(seconds - begin, 0.0, 2 * ramp + coast)
+            v = self.acceleration * ramp
+            up = np.minimum(u, ramp)
+            down = np.maximum(u - ramp - coast, 0.0)
             gone = (
                 self.acceleration * up**2 / 2
                 + v * np.clip(u - ramp, 0.0, coast)
@@ -127,7 +131,8 @@ class Nod:
 
     def _moves(self) -> list[tuple[float, float, float, float]]:
         """(from, direction, time of acceleration, time at constant speed) of each move."""
-        moves, at = [], 0.0
+        moves = []
+        at = 0.0
         for stop in self.stops:
             far = abs(stop - at)
             ramp = min(self.rate / self.acceleration, math.sqrt(far / self.acceleration))

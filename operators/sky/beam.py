@@ -95,10 +95,12 @@ class Convolved:
         if not mask.size:
             return np.zeros((0, 0), np.uint8)
         whole = np.zeros(self.coefficients["float64"].shape, np.uint8)
-        ny, nx = len(whole), len(whole.T)
+        ny = len(whole)
+        nx = len(whole.T)
         y = np.floor((np.arange(ny) - self.bounds[2]) / self.steps[1]).astype(int)
         x = np.floor((np.arange(nx) - self.bounds[0]) / self.steps[0]).astype(int)
-        in_y, in_x = (y >= 0) & (y < mask.shape[0]), (x >= 0) & (x < mask.shape[1])
+        in_y = (y >= 0) & (y < mask.shape[0])
+        in_x = (x >= 0) & (x < mask.shape[1])
         whole[np.ix_(in_y, in_x)] = mask[np.ix_(y[in_y], x[in_x])]
         return whole
 
@@ -135,10 +137,8 @@ def convolve(
     elif not linear:
         grid = _spline(_spline(grid, 0), 1)
     to_grid = np.array([[qx, 0.0, pad_x], [0.0, qy, pad_y], [0.0, 0.0, 1.0]])
-    x, y = (
-        (pad_x - qx / 2, pad_x + (columns - 0.5) * qx),
-        (pad_y - qy / 2, pad_y + (rows - 0.5) * qy),
-    )
+    x = (pad_x - qx / 2, pad_x + (columns - 0.5) * qx)
+    y = (pad_y - qy / 2, pad_y + (rows - 0.5) * qy)
     coarse = bool((across < SMOOTH_BELOW).any())
     return Convolved.of(grid, to_grid, np.array([*x, *y]), (qx, qy), coarse)
 
@@ -182,7 +182,8 @@ def _spline(values: Floats, axis: int) -> Floats:
     (c_(k-1) + 4 c_k + c_(k+1)) / 6 = v_k is a division in the transform.
     """
     rows = np.moveaxis(values, axis, -1)
-    n, period = rows.shape[-1], 2 * rows.shape[-1] - 2
+    n = rows.shape[-1]
+    period = 2 * rows.shape[-1] - 2
     transform = np.fft.rfft(np.concatenate([rows, rows[..., -2:0:-1]], axis=-1))
     found = np.fft.irfft(transform / _at_knots(np.arange(n) / period), period)
     return np.moveaxis(found[..., :n], -1, axis)
@@ -203,7 +204,8 @@ def convolve_evenly(
     of which are at the points and half between them.
     """
     rows, columns = values.shape
-    ny, nx = next_fast_len(rows, True), next_fast_len(columns, True)
+    ny = next_fast_len(rows, True)
+    nx = next_fast_len(columns, True)
     kx, ky = np.fft.rfftfreq(nx), np.fft.fftfreq(ny)[:, None]  # cycles per step
     transfer = np.exp(-2 * np.pi**2 * variance / step**2 * (kx**2 + ky**2))
     transfer /= np.sinc(kx) ** (2 if linear else 4) * np.sinc(ky) ** (2 if linear else 4)
@@ -225,7 +227,8 @@ def _check_size(
 
     cells = np.prod((np.array(shape[::-1]) + 2 * REACH * width) * steps)
     # the grid, its transform, the beam's transform, and one on the way
-    needed, free = 4 * 8 * float(cells), available_memory()
+    needed = 4 * 8 * float(cells)
+    free = available_memory()
     if not needed <= free:
         raise InputError(
             f"convolving the map with the beam needs {needed / 1e9:.3g} GB, {free / 1e9:.3g}"
@@ -245,7 +248,8 @@ def _transfer(covariance: Floats, kx: Floats, ky: Floats, smooth: Bools) -> Floa
         weight_x = _spline_transform(kx, m) if smooth[0] else 1.0
         for n in folds_y:
             weight_y = _spline_transform(ky, n) if smooth[1] else 1.0
-            x, y = kx + m, ky + n
+            x = kx + m
+            y = ky + n
             exponent = (
                 covariance[0, 0] * x**2 + 2 * covariance[0, 1] * x * y + covariance[1, 1] * y**2
             )

@@ -109,7 +109,8 @@ def read(
     comments = [line.lstrip("! ") for line in given.meta.get("comments", ())]
     comments.append(" ".join(name.replace(" ", "_") for name in given.columns))
     units = [unit for _, unit in given.columns.values()]
-    ell, stated = table[:, 0], " ".join([*comments, *units]).lower()
+    ell = table[:, 0]
+    stated = " ".join([*comments, *units]).lower()
     rising = (ell == np.round(ell)).all() and (np.diff(ell) > 0).all()
     for wrong, text in (
         (table.shape[1] < 2, "has one column"),
@@ -158,12 +159,15 @@ def _names(
     place: str,
 ) -> tuple[list[str], str]:
     """Names of the columns behind l, and who says so."""
-    names, who = [_plain(name) for name in given], "as given"
+    names = [_plain(name) for name in given]
+    who = "as given"
     if not names:
         headings = [names for line in comments if len(names := _heading(line)) == number]
-        names, who = list(BY_NUMBER.get(number, ())), "by their number"
+        names = list(BY_NUMBER.get(number, ()))
+        who = "by their number"
         if headings:
-            names, who = headings[-1], "by the file's heading"
+            names = headings[-1]
+            who = "by the file's heading"
     if len(names) != number or "TT" not in names or len(set(names)) < number:
         cure = f"set columns to the names of those behind l, e.g. columns: TT, EE, TE, BB; {CURE}"
         told = f"columns names {', '.join(names)}" if given else "no heading names them"
@@ -215,7 +219,8 @@ def _check_shape(tt: Floats, place: str) -> None:
         return
     ell = np.arange(len(tt))
     power = ell * (ell + 1) * tt
-    low, high = power[10:21].mean(), power[150:301].mean()
+    low = power[10:21].mean()
+    high = power[150:301].mean()
     if low > 0 and high < FALLS * low:
         factor = f"{low / max(high, 1e-300):.3g}"
         raise InputError(

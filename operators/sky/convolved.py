@@ -279,11 +279,13 @@ class ConvolvedSky(SkyInput):
         `_on_own_pixels`.
         """
         assert isinstance(found.factor, float)  # of own pixels alone there is one for each
-        source, factor = grid.source, found.factor * self.scale
+        source = grid.source
+        factor = found.factor * self.scale
         ends = np.array([np.min(source.values, initial=0.0), np.max(source.values, initial=0.0)])
         check_brightness(ends * (found.typical * self.scale), self.place)
         axis = None if source.polarization is None else grid.axis
-        counts, resolution = {ZEROED: source.zeroed, LOST: source.lost}, 0.0
+        counts = {ZEROED: source.zeroed, LOST: source.lost}
+        resolution = 0.0
         side = np.degrees(grid.step) * 3600
         where = f"TAN grid of {grid.size} pixels of {side:.6g} arcsec about the observation"
         if grid.tiles is not None:
@@ -334,7 +336,8 @@ class ConvolvedSky(SkyInput):
         linear = self.interpolation == "linear"
 
         def make() -> Beam:
-            sky, evenly = self.brightness_on(grid, band), grid.gridding
+            sky = self.brightness_on(grid, band)
+            evenly = grid.gridding
             if evenly is not None and fwhm != evenly.fwhm and not grid.is_flat:
                 evenly = Gridding(fwhm, evenly.share)
                 sky = self._brightness(grid, band, evenly)

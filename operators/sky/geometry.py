@@ -109,7 +109,8 @@ class ImageHeader(MapHeader):
         """`ImageMap`'s ``wcs`` and ``placeless`` of an image of ``shape`` (..., ny, nx), or the
         error that says what is missing.
         """
-        header, wanted = with_known_units(self.header, self.place), self.wanted
+        header = with_known_units(self.header, self.place)
+        wanted = self.wanted
         scaled = any(f"CD{i}_{j}" in header for i in (1, 2) for j in (1, 2)) or all(
             f"CDELT{k}" in header for k in (1, 2)
         )
@@ -259,7 +260,8 @@ def placed(image: ImageMap, centre: tuple[float, float] | None) -> Any:
     if centre is None:
         return image.wcs
     rows, columns = image.shape
-    wcs, old = WCS(naxis=2), image.wcs.wcs
+    wcs = WCS(naxis=2)
+    old = image.wcs.wcs
     wcs.wcs.radesys, wcs.wcs.lonpole = "ICRS", 180.0
     wcs.wcs.ctype = ["DEC--TAN", "RA---TAN"] if old.lng == 1 else ["RA---TAN", "DEC--TAN"]
     wcs.wcs.crpix = np.asarray(old.crpix[:2], np.float64)
@@ -274,7 +276,8 @@ def placed(image: ImageMap, centre: tuple[float, float] | None) -> Any:
     matrix = np.asarray(image.wcs.pixel_scale_matrix, np.float64)
     if abs(angle) > ROUNDED:
         # east and north of the image's matrix are its own: each is turned from north to east
-        c, s = np.cos(angle), np.sin(angle)
+        c = np.cos(angle)
+        s = np.sin(angle)
         matrix = np.array([[c, s], [-s, c]] if old.lng == 0 else [[c, -s], [s, c]]) @ matrix
     wcs.wcs.crval = np.degrees([dec, ra] if old.lng == 1 else [ra, dec])
     return rescaled(wcs, matrix)

@@ -129,9 +129,12 @@ def gridded(
         As of `interpolated`.
     """
     nx, ny = target.pixel_shape
-    step, sigma = float(np.radians(target.wcs.cdelt[1])), SIGMA * gridding.fwhm
-    x0, y0 = float(target.wcs.crpix[0]) - 1, float(target.wcs.crpix[1]) - 1
-    found, covered = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool)
+    step = float(np.radians(target.wcs.cdelt[1]))
+    sigma = SIGMA * gridding.fwhm
+    x0 = float(target.wcs.crpix[0]) - 1
+    y0 = float(target.wcs.crpix[1]) - 1
+    found = np.zeros((1 if axis is None else 3, ny, nx))
+    covered = np.zeros((ny, nx), bool)
     for block in blocks(target, tiles, progress):
         covered[block.y, block.x], parts = source.under(block)
         for at in parts:
@@ -139,10 +142,13 @@ def gridded(
             wanted = block.nearest(d)
             if not wanted.any():
                 continue
-            d, at = d[wanted], tuple(k[wanted] for k in at)
+            d = d[wanted]
+            at = tuple(k[wanted] for k in at)
             areas = source.areas(at)
             known = np.isfinite(areas) & source.own_centre(at)
-            d, at, areas = d[known], tuple(k[known] for k in at), areas[known]
+            d = d[known]
+            at = tuple(k[known] for k in at)
+            areas = areas[known]
             planes = source.planes(at, axis)
             powers = factor * (planes if per_area else planes * areas)
             powers[0] -= outside * areas
@@ -171,7 +177,8 @@ def interpolated(
         the meridians through that pole before they are interpolated. None: I alone.
     """
     nx, ny = target.pixel_shape
-    found, covered = np.zeros((1 if axis is None else 3, ny, nx)), np.zeros((ny, nx), bool)
+    found = np.zeros((1 if axis is None else 3, ny, nx))
+    covered = np.zeros((ny, nx), bool)
     poor = 0
     for block in blocks(target, tiles, progress):
         there, values, means = source.interpolated(block, axis, per_area)

@@ -251,7 +251,8 @@ class ImageMap(InputMap):
     def extent(self) -> tuple[Disc | None, bool]:
         rows, columns = (np.linspace(0, n - 1, LATTICE) for n in self.shape)
         lattice: Any = np.meshgrid(rows, columns, indexing="ij")
-        middle, rays = self.directions(self.middle), self.directions(lattice)
+        middle = self.directions(self.middle)
+        rays = self.directions(lattice)
         known = np.isfinite(rays).all(axis=-1)
         if not np.isfinite(middle).all():
             return None, False
@@ -285,7 +286,8 @@ class ImageMap(InputMap):
         if edge.any():  # a part is beyond the projection: the mean of the rest
             cuts = np.linspace(-0.5, 0.5, CUTS + 1)
             corner = self.grid.at(x[edge, None, None] + cuts, y[edge, None, None] + cuts[:, None])
-            a, b = corner[:, 1:, 1:] - corner[:, :-1, :-1], corner[:, 1:, :-1] - corner[:, :-1, 1:]
+            a = corner[:, 1:, 1:] - corner[:, :-1, :-1]
+            b = corner[:, 1:, :-1] - corner[:, :-1, 1:]
             parts = np.linalg.norm(np.cross(a, b), axis=-1) / 2
             there = np.isfinite(parts)
             with np.errstate(invalid="ignore"):
@@ -322,10 +324,13 @@ class ImageMap(InputMap):
         if self._joined:
             middle = np.median(x)
             x = (x - middle + self._period / 2) % self._period - self._period / 2 + middle
-        first, last = np.floor(x.min()) - MARGIN, np.ceil(x.max()) + MARGIN + 1
-        low, high = max(np.floor(y.min()) - MARGIN, 0), min(np.ceil(y.max()) + MARGIN + 1, ny)
+        first = np.floor(x.min()) - MARGIN
+        last = np.ceil(x.max()) + MARGIN + 1
+        low = max(np.floor(y.min()) - MARGIN, 0)
+        high = min(np.ceil(y.max()) + MARGIN + 1, ny)
         if not self._joined:
-            first, last = max(first, 0), min(last, nx)
+            first = max(first, 0)
+            last = min(last, nx)
         return inside, x, y, (np.arange(int(low), int(high)), np.arange(int(first), int(last)))
 
     def _pixels(self, rows: Integers, columns: Integers) -> Pixels:
@@ -368,8 +373,11 @@ class ImageMap(InputMap):
     def under(self, block: Block) -> tuple[Bools, Iterator[Pixels]]:
         ny, nx = self.shape
         x, y, there = self.at(np.concatenate([block.d, block.rim]))
-        known, there = np.isfinite(x) & np.isfinite(y), there[: len(block.d)]
-        x, y, more = x[known], y[known], 2
+        known = np.isfinite(x) & np.isfinite(y)
+        there = there[: len(block.d)]
+        x = x[known]
+        y = y[known]
+        more = 2
         if not x.size:
             return there, iter(())
         columns = np.arange(nx)
@@ -383,7 +391,8 @@ class ImageMap(InputMap):
                 columns = columns[(columns - first) % self._period <= np.ptp(off) + 2 * more]
         else:
             columns = columns[(columns >= x.min() - more) & (columns <= x.max() + more)]
-        low, high = np.floor(y.min()) - more, np.ceil(y.max()) + more + 1
+        low = np.floor(y.min()) - more
+        high = np.ceil(y.max()) + more + 1
         rows = np.arange(max(int(low), 0), min(int(high), ny))
         parts = chunks(len(rows), max(AT_ONCE // max(len(columns), 1), 1))
         pixels = (self._pixels(rows[part], columns) for part in parts)
@@ -412,14 +421,13 @@ class ImageMap(InputMap):
         if not inside.any():
             return least, most
         xx, xy, yy = self.grid.metric(x[inside], y[inside])
-        half, rest = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
+        half = (xx + yy) / 2
+        rest = np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
         narrow = float(np.nanmin(np.sqrt(np.maximum(half - rest, 0.0)), initial=least)) / least
         long = np.sqrt(np.maximum(xx, yy))
         wide = float(np.max(long[np.isfinite(long)], initial=0.0)) / most or 1.0
-        down, up = (
-            np.floor(2 * np.log2(max(narrow, 1e-9)) + 1e-6),
-            np.ceil(8 * np.log2(wide / ALIKE)),
-        )
+        down = np.floor(2 * np.log2(max(narrow, 1e-9)) + 1e-6)
+        up = np.ceil(8 * np.log2(wide / ALIKE))
         return least * float(max(2.0 ** (down / 2), 1 / NARROWEST)), most * float(2.0 ** (up / 8))
 
 
@@ -523,7 +531,8 @@ class HealpixMap(InputMap):
         are covered.
         """
         own = block.d @ self.turn.T
-        seen, near = self._covers(own), np.zeros(0, np.int64)
+        seen = self._covers(own)
+        near = np.zeros(0, np.int64)
         for reach in (MARGIN, 8 * MARGIN, np.inf) if seen.any() else ():
             found, there = self._places(self._within(own[seen], reach * float(self.sides[0])))
             near = found[there]

@@ -221,12 +221,14 @@ class Sources(NamedTuple):
         """
         catalogue = Catalogue.read(step)
         power = catalogue.brightness(observation.instrument.band, step.scale)
-        plane, n = observation.focalplane, observation.n_samples
+        plane = observation.focalplane
+        n = observation.n_samples
         rays = np.stack([-plane.eta, -plane.xi, np.ones(len(plane))], axis=1)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         widest = float(plane.fwhm.max(initial=0.0))
         field = math.atan(plane.radius) + REACH * widest / math.sqrt(8 * math.log(2))
-        lists, first = [np.zeros(0, np.int64)], [0]
+        lists = [np.zeros(0, np.int64)]
+        first = [0]
         for begin in range(0, n, PIECE):
             looks = boresights(observation.sky_boresight[begin : begin + PIECE])
             middle = looks[:, looks.shape[1] // 2]

@@ -78,9 +78,11 @@ def check_templates(config: Mapping[str, Any], nside: int, place: str) -> None:
 
 def band_weights(band: Band) -> tuple[Floats, Floats]:
     """Frequencies [Hz] and PySM's weights there, equation (1)."""
-    nu, t = band.frequency, band.transmission
+    nu = band.frequency
+    t = band.transmission
     seen = np.flatnonzero(t)
-    low, high = float(nu[max(seen[0] - 1, 0)]), float(nu[min(seen[-1] + 1, len(nu) - 1)])
+    low = float(nu[max(seen[0] - 1, 0)])
+    high = float(nu[min(seen[-1] + 1, len(nu) - 1)])
     number = max(math.ceil((high - low) / (STEP * low)), 1)
     at = np.linspace(low, high, number + 1)
     edges = np.union1d(nu[(nu > low) & (nu < high)], at)
@@ -316,7 +318,8 @@ class PySMSky(FullSky):
         """The step that samples the map of an observation's band; made once for each band. Raises
         InputError as `emission`.
         """
-        band, polarized = observation.instrument.band, observation.focalplane.polarized
+        band = observation.instrument.band
+        polarized = observation.focalplane.polarized
         key = band.frequency.tobytes(), band.transmission.tobytes(), bytes([polarized])
         with ALONE:
             if key not in self._skies:

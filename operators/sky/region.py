@@ -98,7 +98,8 @@ def region(
 
     around = float(np.arctan(observation.focalplane.radius)) + reach
     axes = local_axes(*observation.centre)
-    boxes, furthest = [], 0.0
+    boxes = []
+    furthest = 0.0
     for x, y, theta in _on_plane(observation, axes, disc, around):
         furthest = max(furthest, float(theta.max(initial=0.0)))
         if x.size:
@@ -113,12 +114,11 @@ def region(
     if not boxes:
         return Region((0, TILE, 0, TILE), np.zeros((1, 1), bool))
     pad = (np.tan(furthest + around) - np.tan(furthest)) / step + MARGIN
-    low, high = (
-        np.min(boxes, axis=0)[[0, 2]] / step - pad,
-        np.max(boxes, axis=0)[[1, 3]] / step + pad,
-    )
+    low = np.min(boxes, axis=0)[[0, 2]] / step - pad
+    high = np.max(boxes, axis=0)[[1, 3]] / step + pad
     x0, x1, y0, y1 = _snapped(low, high)
-    ny, nx = y1 - y0, x1 - x0
+    ny = y1 - y0
+    nx = x1 - x0
     if nx * ny > MOST_PIXELS:
         raise InputError(
             f"the working grid would have {nx} x {ny} pixels of {np.degrees(step) * 3600:.3g}"
@@ -219,7 +219,8 @@ class Block:
     def rim(self) -> Floats:
         """(m, 3) ICRS directions around the block, a step beyond it."""
         (x0, x1), (y0, y1) = ((int(k.min()) - 1, int(k.max()) + 1) for k in (self.x, self.y))
-        along, up = np.arange(x0, x1 + 1), np.arange(y0, y1 + 1)
+        along = np.arange(x0, x1 + 1)
+        up = np.arange(y0, y1 + 1)
         x = np.concatenate([along, along, np.full(len(up), x0), np.full(len(up), x1)])
         y = np.concatenate([np.full(len(along), y0), np.full(len(along), y1), up, up])
         return directions_on(self.matrix, x, y)
@@ -248,16 +249,20 @@ def blocks(
     ``thin``: only every ``thin``-th point along each axis.
     """
     nx, ny = target.pixel_shape
-    matrix, step = pixel_matrix(target), float(np.radians(abs(target.wcs.cdelt[1])))
-    total, done = nx * ny if tiles is None else int(tiles.sum()) * TILE**2, 0
+    matrix = pixel_matrix(target)
+    step = float(np.radians(abs(target.wcs.cdelt[1])))
+    total = nx * ny if tiles is None else int(tiles.sum()) * TILE**2
+    done = 0
     progress(0, total)
     for y0 in range(0, ny, BLOCK):
         for x0 in range(0, nx, BLOCK):
-            y1, x1 = min(y0 + BLOCK, ny), min(x0 + BLOCK, nx)
+            y1 = min(y0 + BLOCK, ny)
+            x1 = min(x0 + BLOCK, nx)
             y, x = (k.ravel() for k in np.mgrid[y0:y1:thin, x0:x1:thin])
             if tiles is not None:
                 wanted = tiles[y // TILE, x // TILE]
-                y, x = y[wanted], x[wanted]
+                y = y[wanted]
+                x = x[wanted]
             if not y.size:
                 continue
             yield Block(y, x, matrix, step, (x0, x1, y0, y1), tiles)

@@ -98,8 +98,10 @@ def sample(
     A sample whose 4 x 4 coefficients are not all on the grid is left as it is. Samples behind the
     tangent plane are counted in both numbers.
     """
-    kind, width = out.dtype.type, coefficients.shape[1]
-    offsets, constants = (rows.xi.astype(kind), rows.eta.astype(kind)), CONSTANTS.astype(kind)
+    kind = out.dtype.type
+    width = coefficients.shape[1]
+    offsets = (rows.xi.astype(kind), rows.eta.astype(kind))
+    constants = CONSTANTS.astype(kind)
     of_map = rows.numbers, coefficients.reshape(-1), width, covered, constants
     beyond, behind = _add_map(*chunks, *offsets, *of_map, linear, over, out)
     return int(beyond), int(behind)
@@ -129,8 +131,10 @@ def pointing(
         Type of the samples, float32 or float64, and of ``h`` and ``limits``.
     """
     m = -(-len(quaternions) // CHUNK)
-    h, limits = np.empty((m, 9, CHUNK), kind), np.empty((m, 8), kind)
-    box, ones = np.empty((m, 9, 2)), np.empty((m, 2), np.int32)
+    h = np.empty((m, 9, CHUNK), kind)
+    limits = np.empty((m, 8), kind)
+    box = np.empty((m, 9, 2))
+    ones = np.empty((m, 2), np.int32)
     _point(quaternions, matrix, *shape, bounds, h, box, limits, ones)
     return Chunks(h, box, limits, ones)
 

@@ -247,11 +247,14 @@ class SkyInput(Operator):
             raise InputError(message, place=self.place, cure="remove te")
         terms = sz_of_band(band)
         if isinstance(self.te, Path):
-            weight, value = np.abs(source.values), self._temperatures(source, self.te)
+            weight = np.abs(source.values)
+            value = self._temperatures(source, self.te)
             mean = float(np.sum(value * weight) / max(weight.sum(), 1e-300))
-            factor, text = sz_per_y(terms, value), f"{self.te.name}, mean weighted by y "
+            factor = sz_per_y(terms, value)
+            text = f"{self.te.name}, mean weighted by y "
         else:
-            mean, text = cast(float, self.te), ""
+            mean = cast(float, self.te)
+            text = ""
             factor = sz_per_y(terms, mean)
         kev = Unit("J").write_in_unit_of(mean, "1 keV")
         text += f"{kev}: {sz_per_y(terms, mean):.5g} K_RJ per y"
@@ -326,7 +329,8 @@ class SkyInput(Operator):
 
     def _progress(self, what: str) -> Progress:
         """Callback that moves the progress bar."""
-        hook, text = manager().hook, f"{self.label}: {what}"
+        hook = manager().hook
+        text = f"{self.label}: {what}"
         return lambda done, total: hook.zonda_progress(done=done, total=total, what=text)
 
     @property
@@ -370,7 +374,8 @@ class SkyInput(Operator):
         """Check that scans are about a point of the map, by its header; states the share of samples
         outside.
         """
-        header, targets = self._header(), dict.fromkeys(o.centre for o in data.observations)
+        header = self._header()
+        targets = dict.fromkeys(o.centre for o in data.observations)
         placeless = isinstance(header, ImageMap) and header.placeless and self.centre is None
         if len(targets) > 1 and (self.centre == "target" or placeless):
             warnings.warn(

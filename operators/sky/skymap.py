@@ -90,13 +90,16 @@ class ScanSampler:
         """Add the sky to a block's stream (`sampling.sample`), and count the samples that see
         none.
         """
-        plane, index = block.observation.focalplane, self.index[block.detectors]
-        xi, eta = plane.xi[block.detectors], plane.eta[block.detectors]
+        plane = block.observation.focalplane
+        index = self.index[block.detectors]
+        xi = plane.xi[block.detectors]
+        eta = plane.eta[block.detectors]
         efficiency = plane.polarization_efficiency[block.detectors]
         beyond = behind = 0
         if not self.beams:
             boresight = block.observation.sky_boresight[block.samples]
-            beyond, behind = out.size, self.grid.behind(boresight, xi, eta)
+            beyond = out.size
+            behind = self.grid.behind(boresight, xi, eta)
         for number, beam in enumerate(self.beams):
             rows = np.flatnonzero(index == number)
             if not rows.size:
@@ -106,7 +109,8 @@ class ScanSampler:
             # detectors share it
             chunks = self._chunks.get(key, partial(beam.pointing, block, kind))
             found = beam.add(0, chunks, Rows(rows, xi[rows], eta[rows]), out, linear, over)
-            beyond, behind = beyond + found[0], behind + found[1]
+            beyond = beyond + found[0]
+            behind = behind + found[1]
             rows = rows[efficiency[rows] > 0]
             if self.angles is None or not rows.size:
                 continue
@@ -115,7 +119,8 @@ class ScanSampler:
             q, u = (block.buffer(f"sky {name}", (rows.size, out.shape[1])) for name in "QU")
             beam.add(1, chunks, own, q, linear, True)
             beam.add(2, chunks, own, u, linear, True)
-            detectors, start = rows + block.detectors.start, block.samples.start
+            detectors = rows + block.detectors.start
+            start = block.samples.start
             self.angles.add(detectors, start, efficiency[rows], (q, u), rows, out)
         if not block.again:  # a block that is made again is counted once
             self._counts[block.detectors.start, block.samples.start] = (beyond, behind)

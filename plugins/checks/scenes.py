@@ -122,9 +122,11 @@ def scan(
     if offsets is not None:
         plane.xi, plane.eta = (np.asarray(o, np.float64) for o in offsets)
     t = np.arange(samples) / 100.0
-    reach, turn = np.radians(radius / 60), 2 * np.pi * t / 20
+    reach = np.radians(radius / 60)
+    turn = 2 * np.pi * t / 20
     (az, el), (ra, dec) = np.radians([azimuth, elevation]), np.radians(TARGET)
-    x, y = reach * np.cos(turn), reach * np.sin(turn)
+    x = reach * np.cos(turn)
+    y = reach * np.sin(turn)
     return Observation(
         "scan-000",
         0,
@@ -174,7 +176,8 @@ def run(
     **settings: Any,
 ) -> Data:
     """A pipeline of operators over one made-up scan, and a made-up signal where one is given."""
-    points, gives = Points(), Gives()
+    points = Points()
+    gives = Gives()
     points._observation, gives._signal = observation, signal
     steps = [points, *([gives] if signal is not None else []), *operators]
     pipeline = Pipeline(steps, precision=precision)
@@ -218,7 +221,8 @@ def largest(*figures: float) -> float:
 
 def differing(one: Any, other: Any) -> int:
     """Number of values of two arrays that are not the same bits (NaN equals NaN)."""
-    a, b = np.asarray(one), np.asarray(other)
+    a = np.asarray(one)
+    b = np.asarray(other)
     if a.shape != b.shape or a.dtype != b.dtype:
         return max(a.size, b.size, 1)
     same = (a == b) | ((a != a) & (b != b))

@@ -70,7 +70,8 @@ class Seen:
         """(12, 24, 3) quantiles of the PWV [m] at each hour (UTC) on the 15th of each month."""
         from scipy.interpolate import make_interp_spline
 
-        year, hours = self.when.datetime.year, range(0, 24, CELL)
+        year = self.when.datetime.year
+        hours = range(0, 24, CELL)
         dates = [f"{year:04d}-{month:02d}-15T" for month in range(1, 13)]
         found = np.array(
             [[pwv_at(self.site, Instant.parse(f"{d}{h:02d}:00Z")) for h in hours] for d in dates]
@@ -148,12 +149,14 @@ def lines(seen: Seen, year: Sequence[Month]) -> list[str]:
 
 
 def _head(seen: Seen) -> list[str]:
-    site, night = seen.site, seen.night
+    site = seen.site
+    night = seen.night
     where = (
         f"{math.degrees(site.latitude):.4f} deg, {math.degrees(site.longitude):.4f} deg,"
         f" {site.altitude:g} m"
     )
-    begin, end = night.times[0], night.times[-1]
+    begin = night.times[0]
+    end = night.times[-1]
     offset = solar_offset(site)
     found = [
         f"{seen.name} from {site.name} ({where})",
@@ -176,7 +179,8 @@ def _head(seen: Seen) -> list[str]:
 
 
 def _when_up(seen: Seen) -> str:
-    night, offset = seen.night, solar_offset(seen.site)
+    night = seen.night
+    offset = solar_offset(seen.site)
     time, elevation = night.highest
     moves = math.degrees(np.ptp(night.target.elevation)) > 0.1
     at = f" at {clock(time)} UTC ({clock(time + offset)} solar)" if moves else ""
@@ -259,7 +263,8 @@ def _year(seen: Seen, year: Sequence[Month]) -> list[str]:
 
 def as_dict(seen: Seen, year: Sequence[Month]) -> dict[str, Any]:
     """Everything as plain values: times are ISO 8601 UTC, angles degrees, the PWV millimetres."""
-    night, site = seen.night, seen.site
+    night = seen.night
+    site = seen.site
     time, elevation = night.highest
     table = []
     for number, (name, month) in enumerate(zip(MONTHS, year, strict=True)):
@@ -328,7 +333,9 @@ HORIZON = math.radians(-50 / 60)
 """Elevation of the Sun's centre below which it is night: its radius, and the refraction that is
 usual at the horizon.
 """
-MINUTE, HOUR, DAY = 60.0, 3600.0, 86400.0
+MINUTE = 60.0
+HOUR = 3600.0
+DAY = 86400.0
 
 
 def spans_above(times: Floats, values: Floats) -> list[tuple[float | None, float | None]]:
@@ -349,9 +356,11 @@ def share_above(*values: Floats) -> Floats:
     """(..., n - 1) share of each step over which all of ``values`` (..., n) are above 0, linear
     within it.
     """
-    low, high = np.zeros_like(values[0][..., 1:]), np.ones_like(values[0][..., 1:])
+    low = np.zeros_like(values[0][..., 1:])
+    high = np.ones_like(values[0][..., 1:])
     for value in values:
-        a, b = value[..., :-1], value[..., 1:]
+        a = value[..., :-1]
+        b = value[..., 1:]
         with np.errstate(divide="ignore", invalid="ignore"):
             cross = np.where(a == b, 0.0, a / (a - b))
         low = np.maximum(low, np.where(a > 0, 0.0, np.where(b > 0, cross, 1.0)))
@@ -404,7 +413,8 @@ class Night:
     @property
     def hours(self) -> tuple[float, float]:
         """Hours above the limit: in all, and at night."""
-        high, dark = self.target.elevation - self.above, HORIZON - self.sun.elevation
+        high = self.target.elevation - self.above
+        dark = HORIZON - self.sun.elevation
         return float(share_above(high).sum()) / 60, float(share_above(high, dark).sum()) / 60
 
     @property
@@ -483,11 +493,10 @@ def months(site: Site, year: int, target: Target | str, above: float) -> Iterato
         )
         times = starts[:, None] + STEP * np.arange(round(DAY / STEP) + 1)
         at, sun = tracks(site, times.ravel(), target, "sun")
-        elevation, depth = (
-            at.elevation.reshape(times.shape),
-            HORIZON - sun.elevation.reshape(times.shape),
-        )
-        everything, night = share_above(elevation - above), share_above(elevation - above, depth)
+        elevation = at.elevation.reshape(times.shape)
+        depth = HORIZON - sun.elevation.reshape(times.shape)
+        everything = share_above(elevation - above)
+        night = share_above(elevation - above, depth)
         taken = (night if night.any() else everything).mean(axis=0).reshape(24, -1).mean(axis=1)
         distance = at.distance(sun)
         yield Month(

@@ -152,7 +152,8 @@ def variance(
     """Equation (1) from about so many waves, averaged over probes in a circle of ``radius`` [rad]
     about the map's centre; of a ``template`` the variance is relative to its signal.
     """
-    step, number = survey.atmosphere, len(survey.observations)
+    step = survey.atmosphere
+    number = len(survey.observations)
     if step is None or step.pwv_rms == 0:
         return Left(np.zeros(number), 0.0)
     found = calibrated(step.model(survey.observations[survey.configured[0]]))
@@ -160,7 +161,9 @@ def variance(
     shares = _expected(survey, found)
     share = np.array([s.sum() for s in shares]) * [k not in step.omit for k in range(len(shares))]
     some = survey.offsets[:: max(1, len(survey.offsets) // DETECTORS)]  # they stand for all
-    total, spread, modes = np.zeros(len(scans)), 0.0, []
+    total = np.zeros(len(scans))
+    spread = 0.0
+    modes = []
     rows = [] if template is None else _rows(survey, scans, template)
     rng = np.random.default_rng(3)
     for k in np.flatnonzero(share > NEGLIGIBLE * share.sum()).tolist():
@@ -198,7 +201,8 @@ def _scans(survey: Survey, radius: float) -> list[_Scan]:
     angle = 2 * np.pi * (GOLDEN * np.arange(POINTS) % 1)
     distance = radius * np.sqrt((np.arange(POINTS) + 0.5) / POINTS)[:, None]
     probes = distance * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    little, zero = 1e-4 * np.eye(3)[1:], np.zeros(1)
+    little = 1e-4 * np.eye(3)[1:]
+    zero = np.zeros(1)
     found = []
     for k, plane in enumerate(scan_planes(survey.observations[:MOST])):
         track = survey.track(k, rate)
@@ -256,7 +260,8 @@ def _expected(survey: Survey, found: Calibrated) -> list[Floats]:
         form = phase**2 / (phase**2 + 4) if survey.common else 1.0
         power = (found.kelvin * layer.amplitude) ** 2 * number**2 * _spectrum(found, k, number)
         each = power / (2 * np.pi) * above * form
-        slow, fast = each / (1 + phase**2), each / (1 + phase)
+        slow = each / (1 + phase**2)
+        fast = each / (1 + phase)
         shares.append(slow / max(slow.sum(), 1e-300) * fast.sum() + fast)
     return shares
 
@@ -289,11 +294,14 @@ def _of_waves(
     """(n_scan, n_wave) the square in equation (1) over (sum g)^2, after each scan, averaged over
     probes.
     """
-    squares, amount, n = np.zeros((POINTS, len(waves))), np.zeros(POINTS), len(waves)
+    squares = np.zeros((POINTS, len(waves)))
+    amount = np.zeros(POINTS)
+    n = len(waves)
     rows = []
     for scan, weight in zip(scans, survey.weights, strict=False):
         both, across = scan.waves(survey, model, waves)
-        series, mean = both[:n] + 1j * both[n:], np.zeros(n)
+        series = both[:n] + 1j * both[n:]
+        mean = np.zeros(n)
         if survey.common:
             mean = np.exp(1j * (across @ some.T)).mean(axis=1)
         for i, seen in enumerate(scan.density):
@@ -342,7 +350,8 @@ def _of_template(
     waves: Floats,
 ) -> Floats:
     """(n_scan, n_wave) the square in equation (1) of a template (`Template`), after each scan."""
-    squares, n = [], len(waves)
+    squares = []
+    n = len(waves)
     for scan, (offsets, share, seen) in zip(scans, rows, strict=True):
         both, across = scan.waves(survey, model, waves)
         phases = np.exp(1j * (across @ offsets.T)).astype(np.complex64)
@@ -386,9 +395,12 @@ def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
     stays.
     """
     independent = 2 * float(spectrum.sum()) ** 2 / max(float((spectrum**2).sum()), 1e-300)
-    number, few, o = len(survey.offsets), len(covariance), survey.observations[0]
+    number = len(survey.offsets)
+    few = len(covariance)
+    o = survey.observations[0]
     f = np.linspace(max(survey.cut, 1 / o.duration), o.sample_rate / 2, 4000)
-    own, shared = np.zeros_like(f), 0.0
+    own = np.zeros_like(f)
+    shared = 0.0
     for noise in survey.levels[0]:
         power = np.ones_like(f) if noise.spectrum is None else noise.spectrum(f)
         each = noise.sample**2 / (o.sample_rate / 2) * power
@@ -399,8 +411,10 @@ def _mode(survey: Survey, covariance: Floats, spectrum: Floats) -> Mode:
         return Mode(independent, 0.0, Noise(0.0))
     values = 2 * o.duration * variance**2 / float(np.trapezoid(own**2, f))
     eigenvalues, vectors = np.linalg.eigh(covariance + shared)
-    u, first = vectors[:, -1], max(float(eigenvalues[-1]), 1e-300) * number / few
-    step, second = survey.steps.common, variance * (1 + math.sqrt(number / values)) ** 2
+    u = vectors[:, -1]
+    first = max(float(eigenvalues[-1]), 1e-300) * number / few
+    step = survey.steps.common
+    second = variance * (1 + math.sqrt(number / values)) ** 2
     if step is not None and step.on_undetermined == "mean" and second > first + variance:
         # it is lost in the noise, far from determined: the detectors' mean is removed
         return Mode(independent, 0.0, Noise(0.0))

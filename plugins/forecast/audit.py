@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 
 COMPONENTS = {"white": "white", "1/f": "pink", "atmosphere": "atmosphere"}
 """By part of the noise, the component that makes it."""
-TOGETHER, SKY, GIVEN = "together", "only_source", "source_unfiltered"
+TOGETHER = "together"
+SKY = "only_source"
+GIVEN = "source_unfiltered"
 RATIO = "S/N"
 """Rows that begin so are numbers; the others K_RJ."""
 
@@ -133,7 +135,8 @@ def audit(
             cure="ask for 2 or more",
         )
     every = list(dict.fromkeys(p for f in forecasts.values() for p in f.parts("I")))
-    first, made = file.scene().seed, list[dict[str, dict[str, MapProduct]]]()
+    first = file.scene().seed
+    made = list[dict[str, dict[str, MapProduct]]]()
     sky = next((f.source.sky for f in forecasts.values() if f.source), None)
     variant = _signals(file, every, sky)
     name = next(o.product for o in variant.pipeline.operators if isinstance(o, BinMap))
@@ -187,12 +190,14 @@ def _of_source(
     """Rows of the source: its peak, and its S/N by all noise; ``scale``: of the source over the one
     in the maps.
     """
-    depth, end = of.planes["I"], float(of.planes["I"].seconds[-1])
+    depth = of.planes["I"]
+    end = float(of.planes["I"].seconds[-1])
     maps = [{k: one[k].by_stokes()["I"] for k in (SKY, GIVEN, TOGETHER)} for one in made]
     sigma = of.fwhm / FWHM_PER_SIGMA
     beam = np.exp(-((maps[0][SKY].distance() / sigma) ** 2) / 2)
     peaks = scale * np.array([_mean(m[SKY], beam) for m in maps])
-    mean, seeds = abs(float(peaks.mean())), len(made)
+    mean = abs(float(peaks.mean()))
+    seeds = len(made)
     pixels = maps[0][SKY].pixel ** 2 / 24 / sigma**2  # share of a point's peak that they smear
     error = math.hypot(float(peaks.std(ddof=1)) / math.sqrt(seeds), pixels * mean)
     rows = [Row("peak of the source", abs(float(source.left(end))), mean, error, seeds)]
@@ -245,7 +250,10 @@ class _Maps(Metric):
     source, filtered and not, where there is one."""
 
     def __init__(self, parts: Sequence[str], bands: Sequence[str], name: str, source: bool) -> None:
-        self.parts, self.bands, self.name, self.source = parts, bands, name, source
+        self.parts = parts
+        self.bands = bands
+        self.name = name
+        self.source = source
 
     def measure(self, data: Data) -> dict[str, dict[str, MapProduct]]:
         found = {}

@@ -93,7 +93,8 @@ def calculate(
     The band's transmission weighs its frequencies in (5), and dnu is its equivalent width. Raises
     InputError for a band outside the tables of the atmosphere.
     """
-    frequency, response = band.frequency, band.transmission
+    frequency = band.frequency
+    response = band.transmission
     seen = spectrum(
         layers,
         math.pi / 2,
@@ -155,7 +156,8 @@ def of_survey(survey: Survey, seconds: float) -> Calculated | None:
     """`calculate` for the middle of the first scan, ``seconds`` on the source; None where the scene
     has no atmosphere.
     """
-    step, first = survey.atmosphere, survey.observations[survey.configured[0]]
+    step = survey.atmosphere
+    first = survey.observations[survey.configured[0]]
     if step is None:
         return None
     model = step.model(first)

@@ -130,14 +130,16 @@ def text(
         wrong = "the PWV is given twice, as a value and as a quantile"
         raise InputError(wrong, place=PLACE, cure="give --pwv or --quantile")
     if elevation is not None and target is not None:
-        wrong, cure = "a target has an elevation of its own", "give --target or --elevation"
+        wrong = "a target has an elevation of its own"
+        cure = "give --target or --elevation"
         raise InputError(wrong, place=PLACE, cure=cure)
     if month is not None and not 1 <= month <= 12:
         raise InputError(f"there is no month {month}", place="--month", cure="give 1 to 12")
     if quantile is not None and not 0 < quantile < 1:
         wrong = f"a quantile of {quantile} is outside the limits, above 0 and below 1"
         raise InputError(wrong, place="--quantile")
-    camera, place = registry.instruments.create(instrument), registry.sites.create(site)
+    camera = registry.instruments.create(instrument)
+    place = registry.sites.create(site)
     height = positive("--elevation", Unit("rad", "60 deg"), elevation, ELEVATION)
     if height > math.pi / 2:
         wrong = f"an elevation of {elevation} is outside the limits, 0 to 90 deg"
@@ -145,7 +147,9 @@ def text(
     wanted = positive("--integration", Unit("s", "3 h"), integration, 3600.0)
     usual = min(2 * max(camera.field_of_view, 10 * camera.beam_fwhm), WIDEST)
     size = positive("--area", Unit("rad"), area, usual)
-    middle, day, note = _midnight(place, month), None, ""
+    middle = _midnight(place, month)
+    day = None
+    note = ""
     if target is not None:
         centre = parsed("--target", Target.parse, target)
         day = Day.of(place, middle, centre)
@@ -166,7 +170,8 @@ def text(
     start = middle.shifted(-half)
     if quantile is not None:
         pwv = f"{100 * quantile:.12g} %"
-    angle, rate = Unit("rad"), Unit("rad / s")
+    angle = Unit("rad")
+    rate = Unit("rad / s")
     lines = [
         f"name: sensitivity_{instrument}",
         f"description: {note}" if note else "",
@@ -196,7 +201,8 @@ def text(
 def daisy(instrument: Instrument, elevation: float, area: float, seconds: float) -> Daisy:
     """Equations (1) and (2) for an area of diameter ``area`` [rad] at an ``elevation`` [rad], and
     the scans that fill ``seconds``."""
-    radius, telescope = area / 2, instrument.telescope
+    radius = area / 2
+    telescope = instrument.telescope
     acceleration, fastest = _limits(telescope, elevation)
     speed = min(
         ACCELERATION * math.sqrt(acceleration * radius),
@@ -216,7 +222,8 @@ def _limits(telescope: Telescope, elevation: float) -> tuple[float, float]:
     """Largest acceleration and speed on the sky in any direction, rad/s2 and rad/s; infinite where
     none is known.
     """
-    t, across = telescope, math.cos(elevation)
+    t = telescope
+    across = math.cos(elevation)
     acceleration, speed = (
         min([azimuth * across if azimuth else math.inf, *filter(None, others)])
         for azimuth, *others in (
@@ -245,10 +252,8 @@ def _culminating(site: Site, middle: Instant, elevation: float) -> Target:
     azimuth = math.pi if site.latitude >= 0 else 0.0
     transform = CelestialTransform(site, middle, 1.0)
     x, y, z = transform.icrs(unit_vectors(-azimuth, elevation), np.zeros(1))[0]
-    right_ascension, declination = (
-        math.degrees(math.atan2(y, x)) % 360,
-        math.degrees(math.atan2(z, math.hypot(x, y))),
-    )
+    right_ascension = math.degrees(math.atan2(y, x)) % 360
+    declination = math.degrees(math.atan2(z, math.hypot(x, y)))
     return Target.parse(f"{right_ascension:.4f} deg {declination:.4f} deg")
 
 
@@ -290,7 +295,8 @@ class Day:
         nearest to that where it stays below an elevation ``most`` [rad].
         """
         top = int(np.argmax(self.elevation))
-        middle, note = top, ""
+        middle = top
+        note = ""
         if self.elevation[top] > most:
             reach = math.ceil(half / GRID)
             highest = maximum_filter1d(self.elevation, 2 * reach + 1, mode="wrap")

@@ -45,7 +45,8 @@ def read_depth(
 
     Raises InputError.
     """
-    wrong, cure = "", f"write e.g. {examples}"
+    wrong = ""
+    cure = f"write e.g. {examples}"
     units = {a: unit for a, unit in ALIASES.items() if unit in factors} | {u: u for u in factors}
     known = {
         prefix + name: (size, unit)
@@ -67,9 +68,11 @@ def read_depth(
         value = float(match["number"]) * size / factors[unit]
         if math.isfinite(value) and value > 0:
             return value
-        wrong, cure = f"no observation reaches a depth of {text}", "give a positive depth"
+        wrong = f"no observation reaches a depth of {text}"
+        cure = "give a positive depth"
         if place != "--reach":
-            wrong, cure = f"{text} is not positive", "give its magnitude, also of a decrement"
+            wrong = f"{text} is not positive"
+            cure = "give its magnitude, also of a decrement"
     raise InputError(wrong, place=place, cure=cure)
 
 
@@ -78,7 +81,8 @@ def prefixed(value: float, unit: str) -> tuple[float, str]:
     scales = [(1.0, 1.0, unit), (1e-3, 1e3, f"m{unit}"), (1e-8, 1e6, f"u{unit}")]
     last = (1e9, f"n{unit}")
     if unit == "MJy/sr":
-        scales, last = [(0.1, 1.0, unit), (1e-4, 1e3, "kJy/sr")], (1e6, "Jy/sr")
+        scales = [(0.1, 1.0, unit), (1e-4, 1e3, "kJy/sr")]
+        last = (1e6, "Jy/sr")
     size = abs(value) or 1e-8
     return next(((factor, name) for least, factor, name in scales if size >= least), last)
 
@@ -217,7 +221,8 @@ def depths_of(survey: Survey, radius: float) -> dict[str, Depth]:
     )
     known = np.isfinite(sum(each["white"] + each["1/f"] for each in variances.values()))
     if not known[-1]:
-        text, cure = "nothing is observed in the circle", "choose a larger --radius"
+        text = "nothing is observed in the circle"
+        cure = "choose a larger --radius"
         if survey.polarized:
             text = "the samples in the circle determine I, Q and U in no pixel"
             cure += ", or larger pixels"
@@ -275,7 +280,8 @@ def times(depth: Depth, wanted: float | None) -> Floats:
     decade of hours, and the length."""
     end = float(depth.seconds[-1])
     chosen = np.array([end, wanted or end])
-    low, high = chosen.min() / 5, chosen.max() * 20
+    low = chosen.min() / 5
+    high = chosen.max() * 20
     ends = math.floor(math.log10(low / 3600)), math.ceil(math.log10(high / 3600))
     round_ones = 3600 * np.multiply.outer(PER_DECADE, 10.0 ** np.arange(ends[0], ends[1] + 1))
     return np.unique(np.r_[chosen, round_ones[(low <= round_ones) & (round_ones <= high)]])

@@ -174,7 +174,8 @@ def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
     """(n_scan, n_probe, 2) sums of K and K^2 at the probes of all combs; whether they are from some
     of the detectors.
     """
-    rate, offsets = survey.rate, survey.offsets
+    rate = survey.rate
+    offsets = survey.offsets
     tracks = [survey.track(k, rate) for k in range(len(survey.observations))]
     instants = sum(len(t.index) for t in tracks)
     number = instants * len(offsets) * len(chosen)
@@ -186,7 +187,8 @@ def _sums(survey: Survey, chosen: list[Comb]) -> tuple[Floats, bool]:
 
     def near(t: Track, c: Comb) -> Floats:
         found, series = np.zeros((*c.inside.shape, 2)), np.zeros((0, 0), np.float32)
-        place, variance = (c.origin, c.spacing, c.inside.astype(np.float64)), survey.sigma**2
+        place = (c.origin, c.spacing, c.inside.astype(np.float64))
+        variance = survey.sigma**2
         _near(t.matrices, offsets, *place, variance, far, thin, found, series)
         return found[c.inside] * (thin * t.step)
 
@@ -205,7 +207,8 @@ def _signed(survey: Survey, chosen: list[Comb], total: Floats) -> list[Series]:
         there = total[begin : begin + int(comb.inside.sum())]
         begin += len(there)
         for _ in range(max(1, SIGNS // len(chosen))):
-            factors, signs = np.zeros(comb.inside.shape), rng.choice([-1.0, 1.0], len(there))
+            factors = np.zeros(comb.inside.shape)
+            signs = rng.choice([-1.0, 1.0], len(there))
             factors[comb.inside] = np.where(
                 there > 0,
                 signs / np.sqrt(np.where(there > 0, there, 1.0)),
@@ -223,8 +226,10 @@ def kernels(
     few: Indices,
 ) -> AnyFloats:
     """(n_det, n_instant): factor times K of the nearest probe."""
-    found, place = np.zeros((len(few), len(track.index)), np.float32), (comb.origin, comb.spacing)
-    variance, none = survey.sigma**2, np.zeros((0, 0, 2))
+    found = np.zeros((len(few), len(track.index)), np.float32)
+    place = (comb.origin, comb.spacing)
+    variance = survey.sigma**2
+    none = np.zeros((0, 0, 2))
     _near(track.matrices, survey.offsets[few], *place, factors, variance, math.inf, 1, none, found)
     return found
 
@@ -244,7 +249,8 @@ class Filtered:
     def __init__(self, survey: Survey, draws: Sequence[Series], rate: float) -> None:
         number = len(survey.levels[0])
         self._survey = survey
-        self._left, self._all = np.zeros(number), np.zeros(number)
+        self._left = np.zeros(number)
+        self._all = np.zeros(number)
         self._every = len(survey.offsets) <= ALL
         every = len(survey.offsets)
         few = subset(every, every if self._every else DETECTORS)
@@ -285,7 +291,8 @@ def over_white(noise: Noise, frequency: Floats) -> Floats:
     """R at the frequencies of `energies`; of the lowest, where it is steep, its mean over a bin."""
     if noise.spectrum is None:
         return np.ones_like(frequency)
-    found, step = noise.spectrum(frequency), frequency[1]
+    found = noise.spectrum(frequency)
+    step = frequency[1]
     for k in range(min(STEEP, len(found))):
         fine = np.geomspace(max(k - 0.5, 1e-5), k + 0.5, 200) * step
         below = fine[0] * noise.spectrum(fine[:1])[0] if k == 0 else 0.0

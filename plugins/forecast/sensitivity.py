@@ -156,7 +156,8 @@ def _file(pipeline: Any, settings: Sequence[str], asked: Mapping[str, Any]) -> P
         if pipeline in {found.name for found in instruments.candidates()}:
             cure = f"{pipeline} is an instrument: write --instrument {pipeline}"
     elif isinstance(pipeline, PipelineFile) and settings:
-        text, cure = "settings change a pipeline when it is loaded", "give them to zonda.load"
+        text = "settings change a pipeline when it is loaded"
+        cure = "give them to zonda.load"
     if text:
         raise InputError(text, place=default_pipeline.PLACE, cure=cure)
     if pipeline is None:

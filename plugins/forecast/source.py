@@ -122,9 +122,12 @@ class Source(NamedTuple):
                 text = f"a beta of {slope:g} is outside the limits, above 1/3 and up to 3"
                 raise InputError(text, place=PLACE, cure="write e.g. 'beta 1 arcmin 0.7'")
         else:
-            kind, size, slope = "file", 0.0, 0.0
+            kind = "file"
+            size = 0.0
+            slope = 0.0
         if peak is not None and flux is not None:
-            wrong, cure = "the brightness is given twice", "give --peak or --flux"
+            wrong = "the brightness is given twice"
+            cure = "give --peak or --flux"
             raise InputError(wrong, place="--peak, --flux", cure=cure)
         if kind == "beta" and flux is not None and slope <= 1:
             wrong = f"the flux of a beta model of {slope:g} grows without limit with its radius"
@@ -326,10 +329,12 @@ class Placed:
         Raises InputError as `Source.sky`, for a peak that is not on the map, and a brightness that
         is not known.
         """
-        sky, grid = source.sky(survey), survey.grid
+        sky = source.sky(survey)
+        grid = survey.grid
         sky._label = "SkyMap"
         o = survey.observations[0]
-        grid_of_sky, band = sky.grid_of(o), o.instrument.band
+        grid_of_sky = sky.grid_of(o)
+        band = o.instrument.band
         beam = sky.with_beam(grid_of_sky, band, survey.fwhm)
         values = _values(beam)
         at = np.unravel_index(int(np.argmax(abs(values))), values.shape)
@@ -380,7 +385,8 @@ class Placed:
 
     def _sum(self, survey: Survey) -> float:
         """Integral of its brightness, K_RJ sr."""
-        source, o = self.source, survey.observations[0]
+        source = self.source
+        o = survey.observations[0]
         if source.kind == "beta":
             return 2 * math.pi * source.size**2 / (3 * source.slope - 3)
         grid = self.sky.grid_of(o)
@@ -400,7 +406,8 @@ class Placed:
         """
         sums = _sums(survey, self.sky, noisy, air)
         with np.errstate(invalid="ignore", divide="ignore"):
-            kept, smoothed = sums.kept / sums.whole, float(sums.whole[-1] / sums.weight[-1])
+            kept = sums.kept / sums.whole
+            smoothed = float(sums.whole[-1] / sums.weight[-1])
         if not math.isfinite(kept[-1]):
             cure = "choose a source that the scans cross"
             raise InputError("nothing of it is observed", place=PLACE, cure=cure)
@@ -423,13 +430,16 @@ def _sums(survey: Survey, sky: SkyMap, noisy: float, air: bool) -> _Sums:
     What detectors have in common is the mean of the n that are followed, of N: a product of two
     series without it is too small by the factor 1 + (1 - n / N) / (n - 1).
     """
-    number, every = len(survey.observations), len(survey.offsets)
+    number = len(survey.observations)
+    every = len(survey.offsets)
     scans = sparse(number, detector_noise.FILTERED)
     tracks = [survey.track(k, survey.rate) for k in scans]
     most = max(len(t.index) for t in tracks)
     few = subset(every, max(FEWEST, round(SAMPLES / most)))
-    comb, one = Comb(np.zeros(2), 1.0, np.ones((1, 1), np.bool_)), np.ones((1, 1))
-    stands, gain = every / len(few), 1.0
+    comb = Comb(np.zeros(2), 1.0, np.ones((1, 1), np.bool_))
+    one = np.ones((1, 1))
+    stands = every / len(few)
+    gain = 1.0
     if survey.common and len(few) < every:
         gain += (1 - len(few) / every) / (len(few) - 1)
     rows = []
@@ -481,7 +491,8 @@ def series(sky: SkyMap, survey: Survey, track: Track, few: Indices) -> AnyFloats
     """(n_det, n_instant) K_RJ that some detectors (numbers) see of a source along a track, as
     `SkyMap` samples it.
     """
-    o, offsets = track.observation, survey.offsets[few]
+    o = track.observation
+    offsets = survey.offsets[few]
     state = sky.prepare(o)
     out = np.zeros((len(few), len(track.index)), np.float32)
     boresight = np.ascontiguousarray(o.sky_boresight[track.index], np.float64)

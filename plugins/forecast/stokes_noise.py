@@ -61,10 +61,13 @@ def variances(survey: Survey, radius: float) -> dict[str, dict[str, Floats]]:
     averaged over a circle of ``radius`` [rad]; NaN where no pixel there is solved.
     """
     grid = _window(survey, radius)
-    number, taps = len(survey.observations), gaussian_taps(survey.sigma / grid.pixel)
+    number = len(survey.observations)
+    taps = gaussian_taps(survey.sigma / grid.pixel)
     after = np.unique(np.geomspace(1, number, min(number, FOLLOWED)).round().astype(int)) - 1
-    limit, levels = survey.steps.binning.condition_limit, survey.levels
-    a, noise = np.zeros((grid.n_pixels, 6)), np.zeros((len(levels[0]), grid.n_pixels, 6))
+    limit = survey.steps.binning.condition_limit
+    levels = survey.levels
+    a = np.zeros((grid.n_pixels, 6))
+    noise = np.zeros((len(levels[0]), grid.n_pixels, 6))
     found = np.full((len(PLANES), len(levels[0]), number), np.nan)
     for scan, sums in enumerate(_scans(survey, grid)):
         a += survey.weights[scan] * sums
@@ -73,7 +76,9 @@ def variances(survey: Survey, radius: float) -> dict[str, dict[str, Floats]]:
         if scan in after:
             found[:, :, scan] = _smoothed(inverse(a, limit), noise, grid, taps, radius)
     rate = max(PER_PIXEL * survey.speed / grid.pixel, survey.rate) + PER_TURN * survey.modulation
-    solved, looks, planes = inverse(a, limit), _Looks(survey, grid), {}
+    solved = inverse(a, limit)
+    looks = _Looks(survey, grid)
+    planes = {}
     for s, plane in enumerate(PLANES):
         weight = _weight(solved[:, s, s]).reshape(grid.shape)
         draws = _signed(looks, grid, solved[:, s], weight, taps, combs(survey, radius, PROBES))
@@ -118,7 +123,8 @@ def _scans(survey: Survey, grid: TangentGrid) -> Iterator[Floats]:
             index = np.sort(rng.permutation(o.n_samples)[: max(1, round(share * o.n_samples))])
         looking = Looking(o, grid, np.ascontiguousarray(grid.pointing(o)[:, index]))
         angles: PolarizationAngles = polarization_angles(survey, o, index)
-        ones, good = np.ones(len(plane)), np.ones(index.size, np.uint8)
+        ones = np.ones(len(plane))
+        good = np.ones(index.size, np.uint8)
         weights = Weights(ones, ones, np.zeros(0))
         binning = Binning(looking, ones > 0, good, weights, slice(0, 1), angles=angles)
         for first in range(0, len(plane), DETECTORS):
@@ -168,7 +174,8 @@ class _Looks:
     """
 
     def __init__(self, survey: Survey, grid: TangentGrid) -> None:
-        self._survey, self._grid = survey, grid
+        self._survey = survey
+        self._grid = grid
         self._track: Track | None = None
 
     def series(self, rows: NDArray[np.float32], track: Track, few: Indices) -> AnyFloats:
@@ -176,7 +183,8 @@ class _Looks:
         the last: outside.
         """
         if track is not self._track:
-            o, grid = track.observation, self._grid
+            o = track.observation
+            grid = self._grid
             cosine, sine = np.empty((2, len(few), len(track.index)))
             polarization_angles(self._survey, o, track.index).fill(few, 0, cosine, sine)
             efficiency = o.focalplane.polarization_efficiency[few, None]

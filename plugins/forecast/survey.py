@@ -315,7 +315,8 @@ class Survey:
         """FWHM of the map's beam [rad], `core.maps.beams`: by the weights of the detectors of the
         first scan.
         """
-        fwhm, net = self.focalplane.fwhm, self.focalplane.net
+        fwhm = self.focalplane.fwhm
+        net = self.focalplane.net
         net = net if self.steps.binning.weights == "inverse_variance" else np.ones(len(net))
         return expected_fwhm(fwhm, net) or self.scene.instrument.beam_fwhm
 
@@ -353,7 +354,8 @@ class Survey:
         atmosphere, are in I alone: alike detectors there have angles of which cos 2 psi and sin 2
         psi add up to zero.
         """
-        plane, good = self.focalplane, self.observations[0].good_detectors
+        plane = self.focalplane
+        good = self.observations[0].good_detectors
         names = ("xi", "eta", "fwhm", "main_beam_efficiency", "illumination_efficiency")
         seen = np.stack([getattr(plane, name)[good] for name in names], axis=1)
         places, which = np.unique(seen, axis=0, return_inverse=True)
@@ -445,7 +447,8 @@ def survey_of(file: PipelineFile, band: str = "") -> Survey:
 
     Raises PipelineError for what the forecast does not cover, and what the steps raise.
     """
-    chosen, header = steps_of(file), file.header
+    chosen = steps_of(file)
+    header = file.header
     pipeline = Pipeline(chosen.operators, name=header.name, precision=header.precision)
     steps = Steps.among(pipeline.operators)  # copies, which know the scans
     data = observed(pipeline.operators, file.scene(), band)
@@ -496,7 +499,8 @@ def polarization_angles(survey: Survey, observation: Observation, index: Any) ->
 def _alive(observation: Observation) -> Observation:
     """The scan with only those detectors that give data."""
     kept = np.flatnonzero(observation.good_detectors)
-    plane, flags = observation.focalplane.rows(kept), observation.detector_flags[kept]
+    plane = observation.focalplane.rows(kept)
+    flags = observation.detector_flags[kept]
     return replace(observation, focalplane=plane, detector_flags=flags)
 
 

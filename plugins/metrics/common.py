@@ -128,13 +128,15 @@ def relative_error_of_rms(product: MapProduct, where: Bools) -> float:
     w = np.where(where & np.isfinite(product.signal), product.weights, 0.0)
     if not w.any():
         return math.nan
-    cell, grid = 2 * math.pi * (product.smoothed_by / FWHM_PER_SIGMA) ** 2, product.grid
+    cell = 2 * math.pi * (product.smoothed_by / FWHM_PER_SIGMA) ** 2
+    grid = product.grid
     if not isinstance(grid, ImagePixels):
         count = float(np.count_nonzero(w))
         return 1 / math.sqrt(2 * min(grid.solid_angle(w != 0) / cell if cell else np.inf, count))
     rows, columns = (np.flatnonzero(w.any(axis=axis)) for axis in (1, 0))
     window = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-    w, grid = w[window], grid.window(*window)
+    w = w[window]
+    grid = grid.window(*window)
     near = w  # the pixel alone
     if cell > float(np.nanmin(grid.areas)):
         near = smoother(grid, product.smoothed_by)(w) * cell / grid.areas

@@ -66,7 +66,10 @@ from zonda.operators.diagnostics.transfer_function import compare
 
 from .common import COVERED, as_seen, at_beam, covered, extreme, input_of, needs_tan
 
-RINGS, BINS, LAGS, SEPARATIONS = 8, 24, 12, 6
+RINGS = 8
+BINS = 24
+LAGS = 12
+SEPARATIONS = 6
 POLARIZED = 1e-3
 """Of the extreme value of I: below it that of Q or U is taken as zero, which has no relative error.
 """
@@ -123,8 +126,10 @@ class Peak(OfParts):
     instead = "measure peak_ratio or peak_snr, or name peak in zonda accuracy --metric"
 
     def measure(self, data: Data) -> dict[str, Floats]:
-        main, sky = _map(data), _map(data, _sky_alone(data.provenance.get("runs", {})))
-        noises, found = at_beam(main).by_stokes(), {}
+        main = _map(data)
+        sky = _map(data, _sky_alone(data.provenance.get("runs", {})))
+        noises = at_beam(main).by_stokes()
+        found = {}
         for plane, smooth in at_beam(sky).by_stokes().items():
             where, peak = extreme(smooth.signal, covered(smooth), "peak")
             size = peak if plane == "I" else abs(peak)
@@ -169,14 +174,17 @@ class Transfer(OfParts):
         """Transfer (2, n) by plane: T_i, and its standard deviation from the instrument's noise in
         the main map.
         """
-        sky, main = _map(data, _sky_alone(data.provenance.get("runs", {}))), _map(data)
+        sky = _map(data, _sky_alone(data.provenance.get("runs", {})))
+        main = _map(data)
         needs_tan(sky.projection, "transfer")
         image = input_of(data, "transfer")
         window = sky.known_hits / np.percentile(sky.hits[sky.known], 99)
         window = np.where(window >= COVERED, np.minimum(window, 1.0), 0.0)
         side = np.array(window.shape) * sky.pixel
         edges = np.geomspace(1 / side.min(), 1 / max(sky.fwhm, 2 * sky.pixel), RINGS + 1)
-        noises, found, pole = main.by_stokes(), {}, wcs_frame_rotation(sky.wcs)[2]
+        noises = main.by_stokes()
+        found = {}
+        pole = wcs_frame_rotation(sky.wcs)[2]
         for plane, one in sky.by_stokes().items():
             given: Image | None = image
             if plane != "I":
@@ -265,7 +273,8 @@ class Structure(_Binned):
         """(2, n): D, and its relative standard error from the white noise of those detectors (NaN
         where there is none).
         """
-        trace, observation = data.products[TRACE], data.observations[0]
+        trace = data.products[TRACE]
+        observation = data.observations[0]
         s: Floats = trace.streams["atmosphere"]
         n = s.shape[1]
         lags = np.unique(np.geomspace(1, max(1, n // 4), LAGS).astype(int))
@@ -278,7 +287,8 @@ class Structure(_Binned):
             epsilon = plane.illumination_efficiency[index].mean()
             noise = float(trace.streams["white"].std() / epsilon)
         pairs = len(index) * (n - lags) / 2  # increments that overlap share a sample
-        xi, eta = plane.xi[index], plane.eta[index]
+        xi = plane.xi[index]
+        eta = plane.eta[index]
         i, j = np.triu_indices(len(index), 1)
         if not i.size:
             return np.array([in_time, _uncertain(in_time, noise, pairs)])

@@ -165,9 +165,12 @@ class MapPower(FigureMetric):
                 place="map_power",
                 cure=f"maps with a known level: {there}; name others in MapSpectrum.maps",
             )
-        power, level = rings.power[self.of], rings.white[self.of]
+        power = rings.power[self.of]
+        level = rings.white[self.of]
         used = (rings.scale >= self.smallest) & (rings.scale <= self.largest) & np.isfinite(power)
-        number, power, level = rings.modes[used], power[used], level[used]
+        number = rings.modes[used]
+        power = power[used]
+        level = level[used]
         if not number.sum() > 0:
             cure = "choose scales between two pixels and the map's size, or a wider range"
             raise InputError(f"no ring lies {self._range()}", place="map_power", cure=cure)
@@ -336,7 +339,8 @@ def central_rms(
     """Equation (7) of a map as it is, within ``radius`` [rad], and its standard error. InputError
     where no pixel is there.
     """
-    value, near = product.rms(radius, of), product.distance() <= radius
+    value = product.rms(radius, of)
+    near = product.distance() <= radius
     if not math.isfinite(value):
         raise InputError(
             f"no pixel has a value within {angle_text(radius)} of the centre",
@@ -428,7 +432,8 @@ class PeakSnr(_OfSmoothMap):
     def find(self, data: Data, names: Sequence[str]) -> tuple[float, float]:
         """Equation (3); the noise itself scatters the ratio by 1."""
         product = self.smoothed(map_of(data, "peak_snr", "", self.map))
-        factor, error = 1.0, 0.0
+        factor = 1.0
+        error = 0.0
         radius = self.radius or central_diameter(product.fwhm, product.pixel) / 2
         if self.radius is None:
             radius = max(ARCMIN, radius)
@@ -533,7 +538,8 @@ class Coverage(_OfMap):
 
 def coverage(product: MapProduct, radius: float, least: float | None = None) -> float:
     """Equation (4), s; with ``least`` equation (5), arcmin2."""
-    factor, near = product.seconds_per_beam(), product.distance() <= radius
+    factor = product.seconds_per_beam()
+    near = product.distance() <= radius
     if factor is None or not near.any():
         cure = "set the instrument's fwhm and one sample rate, or choose a larger radius"
         raise InputError("the time per beam is not known there", place="coverage", cure=cure)

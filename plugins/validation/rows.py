@@ -74,7 +74,9 @@ class Runs:
     """
 
     def __init__(self, folder: Path, base: Path, say: Say = lambda text: None) -> None:
-        self.folder, self.base, self.say = folder, base, say
+        self.folder = folder
+        self.base = base
+        self.say = say
         self.experiment = Tasks(folder=folder, say=say)
 
     def want(self, experiment: Experiment) -> None:
@@ -90,7 +92,8 @@ class Runs:
         """Values of an experiment, whose runs have been executed."""
         if experiment.calculate is not None:
             return Values((experiment.calculate.value,))
-        choice, seeds = self._choice(experiment), experiment.seeds or 1
+        choice = self._choice(experiment)
+        seeds = experiment.seeds or 1
         name = choice.name if choice else SECONDS
         columns = [self.experiment.figures(v, name)[:seeds] for v in self._variants(experiment)]
         single = [[figure.value for figure in column] for column in columns]
@@ -140,7 +143,8 @@ class Runs:
 
     def _variants(self, experiment: Experiment) -> list[FileVariant]:
         assert experiment.pipeline is not None
-        path, changes = self._path(experiment.pipeline), [experiment.change]
+        path = self._path(experiment.pipeline)
+        changes = [experiment.change]
         if experiment.versus is not None:
             changes.append({**experiment.change, **experiment.versus})
         return [
@@ -240,7 +244,8 @@ class Row:
         comparison = compare(claim.stated, found[""]) if "" in found else None
         counters = []
         for counter in claim.counter:
-            expect, experiment = counter.expect, experiments[counter.name]
+            expect = counter.expect
+            experiment = experiments[counter.name]
             unit = expect.above or expect.below or claim.paper
             alike = unit.unit == claim.paper.unit and experiment.kind == claim.kind
             counters.append(

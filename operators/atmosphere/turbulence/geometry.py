@@ -166,7 +166,8 @@ class Cone:
     def unroll(self, crossings: Floats) -> Floats:
         """Positions on the plane, per metre of height, zero at the centre: (2, ...)."""
         q, angle = self.polar(crossings)
-        x, y = q * np.cos(angle) - np.cos(self.elevation), q * np.sin(angle)
+        x = q * np.cos(angle) - np.cos(self.elevation)
+        y = q * np.sin(angle)
         return np.stack([self.axis[0] * x - self.axis[1] * y, self.axis[1] * x + self.axis[0] * y])
 
     def error(self, crossings: Floats) -> float:
@@ -295,23 +296,32 @@ def scan_plane(observation: Observation) -> ScanPlane:
     level = float(np.hypot(n[0], n[1]))
     a = n[:2] / level if level > 0 else np.zeros(2)
     matrix = np.eye(2) - (1 - n[2]) * np.outer(a, a)
-    transverse, flat = _error(matrix @ matrix, u), _error(np.eye(2), u)
+    transverse = _error(matrix @ matrix, u)
+    flat = _error(np.eye(2), u)
     middle = float(np.median(np.arcsin(boresight[2])))
-    elevation, centre = float(np.arcsin(n[2])), n[:2] / n[2]
+    elevation = float(np.arcsin(n[2]))
+    centre = n[:2] / n[2]
     kind: Literal["transverse", "cone", "horizontal"] = "transverse"
-    bound, cone = transverse, None
+    bound = transverse
+    cone = None
     if transverse > FLAT and level > 0:
         highest = float(np.arcsin(boresight[2]).max()) + float(np.arctan(np.hypot(xi, eta).max()))
         unrolled = Cone(a, middle)
         # The tip of a cone is no place to be near.
         error = unrolled.error(crossing(u)) if highest < np.pi / 2 else np.inf
         if error < min(transverse, flat):
-            kind, bound, cone = "cone", error, unrolled
+            kind = "cone"
+            bound = error
+            cone = unrolled
             matrix = np.eye(2) - (1 - np.sin(middle)) * np.outer(a, a)
-            elevation, centre = middle, a / np.tan(middle)
+            elevation = middle
+            centre = a / np.tan(middle)
     if cone is None and transverse > max(0.5 * flat, FLAT):
         # The mean direction may be the zenith.
-        kind, bound, matrix, elevation = "horizontal", flat, np.eye(2), middle
+        kind = "horizontal"
+        bound = flat
+        matrix = np.eye(2)
+        elevation = middle
     drift: tuple[Floats, float] = (matrix, bound)
     if cone:
         drift = _mean_drift(cone, crossing(boresight))

@@ -168,7 +168,8 @@ def grid_error(
     sin(elevation) where the turbulence lies in the horizontal plane).
     """
     weight, nearness = _weights_and_nearness(layers, [layer.components() for layer in layers])
-    one, two = _separable(x, xi, nearness), _separable(y, eta, nearness * stretch**2)
+    one = _separable(x, xi, nearness)
+    two = _separable(y, eta, nearness * stretch**2)
     total = float((1 - 2 * (one[0] * two[0]).mean(0) + (one[1] * two[1]).mean(0)) @ weight)
     return float(np.sqrt(max(total, 0.0)))
 
@@ -221,10 +222,13 @@ def _gone(nearness: Floats, square: Floats) -> Floats:
     largest = float(square.max(initial=0.0))
     near = nearness * largest > _SERIES_TO
     out = np.zeros(len(nearness))
-    x, powers = nearness[~near] * largest, square / max(largest, 1e-300)
-    term, power = -np.ones(len(x)), np.ones(len(square))
+    x = nearness[~near] * largest
+    powers = square / max(largest, 1e-300)
+    term = -np.ones(len(x))
+    power = np.ones(len(square))
     for k in range(1, _SERIES + 1):
-        term, power = term * -x / k, power * powers
+        term = term * -x / k
+        power = power * powers
         out[~near] += term * power.sum()
     out[near] = -np.expm1(np.multiply.outer(-nearness[near], square)).sum(1)
     return out
@@ -287,7 +291,8 @@ def _spline_table() -> tuple[float, float, Floats, Floats]:
     benchmarks/atmosphere_data).
     """
     with np.load(SPLINE_TABLE) as kept:
-        log_q, log_g = kept["log_q"], kept["log_g"]
+        log_q = kept["log_q"]
+        log_g = kept["log_g"]
     return float(log_q[0]), (len(log_q) - 1) / float(log_q[-1] - log_q[0]), log_g, np.diff(log_g)
 
 

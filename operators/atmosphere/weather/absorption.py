@@ -71,7 +71,8 @@ class AbsorptionTable:
     def __init__(self, path: Path) -> None:
         with own_data(path) as file:
             self._code = np.cumsum(file["difference"], axis=-1, dtype=np.uint16)
-            self._low, self._high = file["low"].astype(np.float64), file["high"].astype(np.float64)
+            self._low = file["low"].astype(np.float64)
+            self._high = file["high"].astype(np.float64)
             self.frequency: Floats = file["frequency"].astype(np.float64)
             self.pressure: Floats = file["pressure"].astype(np.float64)
             self.temperature: Floats = file["temperature"].astype(np.float64)
@@ -121,10 +122,8 @@ class AbsorptionTable:
         InputError
             A pressure or temperature outside the table; the message names the limits.
         """
-        pressure, temperature = (
-            np.asarray(pressure, np.float64),
-            np.asarray(temperature, np.float64),
-        )
+        pressure = np.asarray(pressure, np.float64)
+        temperature = np.asarray(temperature, np.float64)
         below, upper_weight = self._bracket(pressure)
         scale = (self._high - self._low)[..., cells] / 65535.0
         log = self._low[..., cells] + self._code[..., cells] * scale
@@ -136,7 +135,8 @@ class AbsorptionTable:
         dry, water, water_high, ozone = np.exp(total) * 1e-4
         # In the margins the ratios are those of the edge: their mean over a cell stays 1, its ozone
         # is what it is.
-        code, upper = self._ozone_code[..., cells], np.clip(upper_weight, 0.0, 1.0)[:, None]
+        code = self._ozone_code[..., cells]
+        upper = np.clip(upper_weight, 0.0, 1.0)[:, None]
         log_ratio = code[:, below] * (1 - upper) + code[:, below + 1] * upper
         ratio = RATIO_LOW * np.exp(log_ratio * (math.log(RATIO_HIGH / RATIO_LOW) / 255))
         ratio /= np.einsum("g,glf->lf", OZONE_PARTS, ratio)
@@ -144,13 +144,12 @@ class AbsorptionTable:
 
     def _bracket(self, pressure: Floats) -> tuple[Indices, Floats]:
         """Index of the table's pressure below each layer, and the weight of the one above."""
-        grid, x = -np.log(self.pressure), -np.log(pressure)
+        grid = -np.log(self.pressure)
+        x = -np.log(pressure)
         step = grid[1] - grid[0]
         if (x < grid[0] - (PRESSURE_MARGIN - 1) * step).any():
-            worst, limit = (
-                pressure.max() / 100,
-                self.pressure[0] / 100 * 0.72 ** (1 - PRESSURE_MARGIN),
-            )
+            worst = pressure.max() / 100
+            limit = self.pressure[0] / 100 * 0.72 ** (1 - PRESSURE_MARGIN)
             raise InputError(
                 f"a pressure of {worst:.5g} hPa is above the absorption table's limit of"
                 f" {limit:.5g} hPa"
@@ -174,7 +173,8 @@ class AbsorptionTable:
         n_layer).
         """
         nodes = self.temperature[row]
-        low, high = nodes[:, 0] - TEMPERATURE_MARGIN, nodes[:, -1] + TEMPERATURE_MARGIN
+        low = nodes[:, 0] - TEMPERATURE_MARGIN
+        high = nodes[:, -1] + TEMPERATURE_MARGIN
         outside = ((temperature < low) | (temperature > high)) & (pressure > THIN_AIR)
         if outside.any():
             k = int(np.argmax(outside))
@@ -182,7 +182,8 @@ class AbsorptionTable:
                 f"a temperature of {temperature[k]:.1f} K at {pressure[k] / 100:.4g} hPa is outside"
                 f" the absorption table's limits there, {low[k]:.0f} to {high[k]:.0f} K"
             )
-        x, y = 1 / np.clip(temperature, low, high), 1 / nodes
+        x = 1 / np.clip(temperature, low, high)
+        y = 1 / nodes
         n = nodes.shape[1]
         return np.array(
             [

@@ -166,7 +166,8 @@ def standard_column(site: Site) -> Column:
     """
     low = site.altitude + np.array([-100.0, 0, 250, 500, 1000, 1500])
     height = np.concatenate([low, np.arange(site.altitude + 2e3, 47e3, 1e3)])
-    t, p = temperature(height), pressure(height)
+    t = temperature(height)
+    p = pressure(height)
     density = 5e-3 * np.exp(-height / VAPOUR_SCALE_HEIGHT)
     return Column(
         pressure=p,

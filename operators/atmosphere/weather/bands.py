@@ -93,7 +93,8 @@ class BandAtmosphere:
         self.transfer = BandTransfer(band, replace(profile.layers, spectra=spectra))
         self._v_max = -math.log(math.sin(ELEVATION_MIN))
         for n_u, n_v, ratio in GRIDS:
-            self._scale, self._u_max = self.pwv_max / ratio, math.log1p(ratio)
+            self._scale = self.pwv_max / ratio
+            self._u_max = math.log1p(ratio)
             self._coefficients = self._tabulate(n_u, n_v)
             self.error = self._check()
             if self.error < TOLERANCE:
@@ -149,18 +150,21 @@ class BandAtmosphere:
 
     def _tabulate(self, n_u: int, n_v: int) -> Floats:
         """Chebyshev coefficients (2, n_u, n_v) from values at the Chebyshev points."""
-        x_u, x_v = chebyshev_points(n_u), chebyshev_points(n_v)
+        x_u = chebyshev_points(n_u)
+        x_v = chebyshev_points(n_v)
         values = np.array(
             [self.transfer(self._pwv(x), [self._elevation(y) for y in x_v]) for x in x_u]
         )  # (n_u, n_v, 2)
-        to_u, to_v = _transform(n_u), _transform(n_v)
+        to_u = _transform(n_u)
+        to_v = _transform(n_v)
         return np.asarray(np.einsum("iu,uvf,jv->fij", to_u, values, to_v))
 
     def _check(self) -> float:
         """Largest error at 45 points: between the nodes, and the ends."""
         points_u = np.array([-1.0, *chebyshev_points(7), 1.0])
         points_v = [-1.0, -0.61, 0.13, 0.87, 1.0]
-        pwv, elevations = [self._pwv(x) for x in points_u], [self._elevation(y) for y in points_v]
+        pwv = [self._pwv(x) for x in points_u]
+        elevations = [self._elevation(y) for y in points_v]
         direct = np.moveaxis(np.array([self.transfer(each, elevations) for each in pwv]), 2, 0)
         found = np.array([self._evaluate(k, np.array(pwv)[:, None], elevations) for k in range(2)])
         scale = np.concatenate([direct[:1], 1 + np.abs(direct[1:])])
@@ -190,7 +194,8 @@ class BandAtmosphere:
         return -2 * np.log(np.sin(elevation)) / self._v_max - 1
 
     def _evaluate(self, which: int, pwv: ArrayLike, elevation: ArrayLike) -> Floats:
-        pwv, elevation = np.asarray(pwv, np.float64), np.asarray(elevation, np.float64)
+        pwv = np.asarray(pwv, np.float64)
+        elevation = np.asarray(elevation, np.float64)
         if pwv.ndim:
             pwv, elevation = np.broadcast_arrays(pwv, elevation)
         basis = chebvander(self._x(pwv).ravel(), self._coefficients.shape[1] - 1).T
@@ -206,7 +211,8 @@ class BandAtmosphere:
         pwv, dpwv, elevation = np.broadcast_arrays(
             *(np.asarray(a, np.float64) for a in (pwv, dpwv, elevation))
         )
-        start, stop = self._x(pwv).ravel(), self._x(pwv + dpwv).ravel()
+        start = self._x(pwv).ravel()
+        stop = self._x(pwv + dpwv).ravel()
         step = (2 * np.log1p(dpwv / (self._scale + pwv)) / self._u_max).ravel()
         basis = _differences(start, stop, step, self._coefficients.shape[1])
         return self._contract(which, basis, elevation)
@@ -215,7 +221,8 @@ class BandAtmosphere:
         """sum_ij basis_i C_ij T_j(y) of one PWV or many, without BLAS: its sums may depend on the
         number of threads.
         """
-        y, found = self._y(elevation).ravel(), np.empty(elevation.size)
+        y = self._y(elevation).ravel()
+        found = np.empty(elevation.size)
         along = self._coefficients[which]
         for chunk in chunks(len(y)):
             one = basis[:, chunk] if basis.shape[1] > 1 else basis
@@ -265,8 +272,10 @@ class BandTransfer:
         self._layers = layers
         sections = _at_frequencies(layers, frequency, cells)
         self._cross_sections, cell, share = layers.in_parts(sections)
-        self._frequency, self._width = frequency[cell], weight[cell] * share
-        self._weight, self._square = self._width / weight.sum(), square[cell] * share
+        self._frequency = frequency[cell]
+        self._width = weight[cell] * share
+        self._weight = self._width / weight.sum()
+        self._square = square[cell] * share
         self._source = rayleigh_jeans(self._frequency, layers.temperature[:, None])
 
     def __call__(self, pwv: float, elevations: list[float]) -> list[tuple[float, float]]:
@@ -288,7 +297,8 @@ class BandTransfer:
         layers = self._layers.scaled(pwv)
         vertical = layers.opacity(self._cross_sections)
         per_water = layers.opacity_of_water(self._cross_sections)
-        emitted, absorbed = [], []
+        emitted = []
+        absorbed = []
         for elevation in elevations:
             airmass = layers.airmass(elevation)[:, None]
             slant = vertical * airmass
@@ -316,13 +326,17 @@ def _cells(band: Band, table: AbsorptionTable) -> tuple[Floats, Floats, Floats, 
     """
     open_ = np.flatnonzero(band.transmission)  # a table of a passband may have zeros far outside it
     support = slice(max(int(open_[0]) - 1, 0), int(open_[-1]) + 2)
-    nu, transmission = band.frequency[support], band.transmission[support]
+    nu = band.frequency[support]
+    transmission = band.transmission[support]
     cells = table.cells(float(nu[0]), float(nu[-1]), place=f"band '{band.name}'")
-    edges, centre = table.edges[cells.start : cells.stop + 1], table.frequency[cells]
+    edges = table.edges[cells.start : cells.stop + 1]
+    centre = table.frequency[cells]
     points = np.union1d(np.clip(edges, nu[0], nu[-1]), nu)
     cell = np.clip(np.searchsorted(edges, (points[1:] + points[:-1]) / 2) - 1, 0, len(centre) - 1)
-    values, step = np.interp(points, nu, transmission), np.diff(points)
-    low, high = values[:-1], values[1:]
+    values = np.interp(points, nu, transmission)
+    step = np.diff(points)
+    low = values[:-1]
+    high = values[1:]
     # from the centre of the cell that begins there
     offset = (points - centre[np.append(cell, cell[-1])])[:-1]
     first = step * (offset * (2 * low + high) + (offset + step) * (low + 2 * high)) / 6
@@ -338,7 +352,8 @@ def _at_frequencies(layers: Layers, frequency: Floats, cells: slice) -> CrossSec
     """Cross-sections at one frequency in each cell, linear between the cells' centres."""
     centres = layers.table.frequency
     wide = slice(max(cells.start - 1, 0), min(cells.stop + 1, len(centres)))
-    known, centre = layers.cross_sections(wide), centres[wide]
+    known = layers.cross_sections(wide)
+    centre = centres[wide]
     low = np.clip(np.searchsorted(centre, frequency, "right") - 1, 0, len(centre) - 2)
     upper = (frequency - centre[low]) / (centre[low + 1] - centre[low])
     upper = np.clip(upper, 0.0, 1.0)  # of the first and the last cell of the table

@@ -79,7 +79,8 @@ def coefficients(name: str) -> dict[str, NDArray[np.float32]]:
 
 def climatology_column(site: Site, time: Instant) -> Column:
     """Equation (1), with its spreads. Raises `InputError` as `profile`."""
-    name, place = site.climatology, f"site '{site.name}'"
+    name = site.climatology
+    place = f"site '{site.name}'"
     known = climatologies()
     if name is None:
         raise InputError(
@@ -110,7 +111,8 @@ def climatology_column(site: Site, time: Instant) -> Column:
         return basis @ arrays[quantity].astype(np.float64)
 
     every_pressure = arrays["pressure"].astype(np.float64)
-    height, temperature = median("height"), median("temperature")
+    height = median("height")
+    temperature = median("temperature")
     pressure = every_pressure[: len(height)]  # the highest levels have ozone only
     h2o = np.exp(median("log_vapour_density")) * VAPOUR_GAS_CONSTANT * temperature / pressure
     annual = basis[::5]  # 1, cos a, sin a, ...
@@ -154,7 +156,8 @@ def _day_and_hour(time: Instant) -> tuple[float, float]:
 
 def harmonics(day: float, hour: float) -> Floats:
     """(45,) the products A_i H_j of equation (1)."""
-    a, b = 2 * np.pi * day / 365.25, 2 * np.pi * hour / 24
+    a = 2 * np.pi * day / 365.25
+    b = 2 * np.pi * hour / 24
     annual, diurnal = (
         np.concatenate([[1.0], *([np.cos(k * x), np.sin(k * x)] for k in range(1, n + 1))])
         for x, n in ((a, 4), (b, 2))
@@ -174,7 +177,8 @@ class PwvByMonth:
 
 def pwv_by_month(site: Site, year: int = 2023) -> PwvByMonth:
     """PWV by month, from the site's climatology. Raises `InputError` where there is none."""
-    median, quantiles = np.empty((12, len(HOURS))), np.zeros((12, len(QUANTILES)))
+    median = np.empty((12, len(HOURS)))
+    quantiles = np.zeros((12, len(QUANTILES)))
     for month in range(12):
         for k, hour in enumerate(HOURS):
             law = profile(

@@ -89,7 +89,8 @@ class Era5(WeatherSource):
         axes = file.axes()
         pressure = axes["level"].values
         _check_levels(pressure)
-        latitude, longitude = np.degrees(site.latitude), np.degrees(site.longitude)
+        latitude = np.degrees(site.latitude)
+        longitude = np.degrees(site.longitude)
         away = (
             axes["lon"].values - longitude + 180
         ) % 360 - 180  # wherever the file cuts the globe
@@ -110,7 +111,9 @@ class Era5(WeatherSource):
         def column(name: str, logarithm: bool = False) -> Floats:
             return file.interpolated(name, axes, weights, logarithm)[order]
 
-        pressure, temperature, h2o = pressure[order], column("t"), column(water, logarithm=True)
+        pressure = pressure[order]
+        temperature = column("t")
+        h2o = column(water, logarithm=True)
         if water == "q":
             h2o = from_specific(h2o)
         elif RELATIVE[0] <= h2o.max() <= RELATIVE[1]:
@@ -216,7 +219,8 @@ def request(site: Site, time: Instant, hours: int) -> dict[str, Any]:
     """
     first = time.datetime.replace(minute=0, second=0, microsecond=0)
     stamps = [first + timedelta(hours=k) for k in range(hours + 2)]
-    latitude, longitude = math.degrees(site.latitude), math.degrees(site.longitude)
+    latitude = math.degrees(site.latitude)
+    longitude = math.degrees(site.longitude)
     south = max(math.floor(latitude * 4) / 4, -90.0)
     west = math.floor(((longitude + 180) % 360 - 180) * 4) / 4
     stamp = {"year": "%Y", "month": "%m", "day": "%d", "time": "%H:00"}

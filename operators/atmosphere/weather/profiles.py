@@ -90,7 +90,8 @@ class PwvDistribution:
 
     def at(self, quantile: float) -> float:
         """PWV [m] at a quantile between 0 and 1."""
-        normal, centre = NormalDist(), math.log(self.median)
+        normal = NormalDist()
+        centre = math.log(self.median)
         above = self.below if self.above is None else self.above
         reach = math.log(PWV_MAX) - centre
         most = normal.cdf(reach / (above if reach > 0 else self.below))
@@ -219,7 +220,8 @@ class Profile:
         """
         wanted = np.asarray(height, np.float64)
         if wanted.size and not (wanted.min() >= 0 and wanted.max() <= self.height[-1]):
-            given, limits = f"{wanted.min():g} to {wanted.max():g} m", f"0 to {self.height[-1]:g} m"
+            given = f"{wanted.min():g} to {wanted.max():g} m"
+            limits = f"0 to {self.height[-1]:g} m"
             raise InputError(f"heights of {given} above the site are outside the profile, {limits}")
 
         def linear(values: Floats) -> Floats:
@@ -260,7 +262,8 @@ def on_heights(column: Column, site: Site) -> Profile:
     height = TOP * np.expm1(2.5 * np.linspace(0, 1, LEVELS)) / np.expm1(2.5)
     z = site.altitude + height
     inside = np.clip(z, column.height[0], column.height[-1])
-    above, below = np.maximum(z - column.height[-1], 0.0), np.minimum(z - column.height[0], 0.0)
+    above = np.maximum(z - column.height[-1], 0.0)
+    below = np.minimum(z - column.height[0], 0.0)
 
     def linear(values: Floats) -> Floats:
         return np.asarray(np.interp(inside, column.height, values))
@@ -303,7 +306,8 @@ def on_heights(column: Column, site: Site) -> Profile:
         return made
     wide = linear(column.log_vapour_spread)
     low, high = (replace(made, h2o=made.h2o * np.exp(sign * wide)).pwv for sign in (-1, 1))
-    stacked, shares = math.log(high / low) / 2, column.column_spread or (STACKING, STACKING)
+    stacked = math.log(high / low) / 2
+    shares = column.column_spread or (STACKING, STACKING)
     return replace(
         made,
         distribution=PwvDistribution(made.pwv, shares[0] * stacked, shares[1] * stacked),
@@ -311,10 +315,12 @@ def on_heights(column: Column, site: Site) -> Profile:
 
 
 def _check_altitude(column: Column, site: Site) -> None:
-    lowest, highest = column.height[0], column.height[-1]
+    lowest = column.height[0]
+    highest = column.height[-1]
     if lowest - EXTRAPOLATION_MAX <= site.altitude < highest:
         return
-    low, who = site.altitude < lowest, column.stated or "its weather"
+    low = site.altitude < lowest
+    who = column.stated or "its weather"
     where = f"more than {EXTRAPOLATION_MAX:g} m below the lowest" if low else "above the highest"
     raise InputError(
         f"lies at {site.altitude:g} m, {where} level of {who}, {lowest if low else highest:.0f} m",
@@ -376,7 +382,8 @@ def _layer_mean(pressure: Floats, mixing_ratio: Floats) -> Floats:
     """Mean over each layer's mass of a mixing ratio that is a power of the pressure between its
     boundaries. (n - 1,).
     """
-    low, high = mixing_ratio[:-1], mixing_ratio[1:]
+    low = mixing_ratio[:-1]
+    high = mixing_ratio[1:]
     if not mixing_ratio.all():
         return (low + high) / 2
     thickness = np.log(pressure[:-1] / pressure[1:])
@@ -394,8 +401,10 @@ def pwv_steps(profile: Profile) -> list[float]:
     law = profile.distribution
     if not profile.pwv > 0:
         return [0.0, 1e-3]
-    low, high = profile.pwv / 3, min(3 * profile.pwv, PWV_MAX)
+    low = profile.pwv / 3
+    high = min(3 * profile.pwv, PWV_MAX)
     if law is not None:
-        low, high = law.at(0.05), law.at(0.95)
+        low = law.at(0.05)
+        high = law.at(0.95)
     rounded = {float(f"{low * (high / low) ** (k / 3):.1g}") for k in range(4)}
     return sorted({profile.pwv, *(p for p in rounded if abs(p / profile.pwv - 1) > 0.2)})

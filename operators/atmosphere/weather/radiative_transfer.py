@@ -107,7 +107,8 @@ class Layers:
         """
         if pwv == 0:
             return replace(self, h2o=np.zeros_like(self.h2o))
-        air, h2o = -np.diff(self.pressure) / GRAVITY, self.h2o
+        air = -np.diff(self.pressure) / GRAVITY
+        h2o = self.h2o
         for _ in range(
             8
         ):  # the number of molecules depends on the water by a few per mille: converges as 0.005^n
@@ -128,7 +129,8 @@ class Layers:
 
     def _each(self, k: CrossSections) -> Floats:
         """(n, n_frequency) cross-section of a molecule of the air."""
-        water, ozone = self.h2o[:, None], self.o3[:, None]
+        water = self.h2o[:, None]
+        ozone = self.o3[:, None]
         # Linear in the mixing ratio, falling to 0.8 of its dry value at 0.05 at most: it is
         # positive up to 0.25, which no air holds (a source of more than 0.1 is refused), so nothing
         # is cut.
@@ -141,7 +143,8 @@ class Layers:
 
         The pressure stays: vapour takes the place of dry air, which is lighter by its mass.
         """
-        k, water = cross_sections, self.h2o[:, None]
+        k = cross_sections
+        water = self.h2o[:, None]
         heavier = (MOLAR_MASS_WATER - MOLAR_MASS_DRY_AIR) / self._mass
         of_mixing = (
             k.water + 2 * water * k.water_self - k.dry_air - heavier[:, None] * self._each(k)
@@ -262,7 +265,8 @@ def emission_slopes(slant_opacity: Floats, source: Floats) -> Floats:
                    - sum_k>i T_k                                                   (3)
     """
     t = np.maximum(slant_opacity, 0.0)
-    passed, absorbed = np.exp(-t), -np.expm1(-t)
+    passed = np.exp(-t)
+    absorbed = -np.expm1(-t)
     thin = t < 1e-3  # there 1 / t^2 loses digits
     safe = np.where(thin, 1.0, t)
     mean = np.where(thin, 1 - t / 2, absorbed / safe)
@@ -293,7 +297,8 @@ def spectrum(
     table = layers.table
     edges = table.edges
     cells = table.cells(edges[0] if low is None else low, edges[-1] if high is None else high)
-    frequency, airmass = table.frequency[cells], layers.airmass(elevation)[:, None]
+    frequency = table.frequency[cells]
+    airmass = layers.airmass(elevation)[:, None]
     sections = layers.cross_sections(cells)
     vertical = layers.opacity(sections)
     parts, cell, share = layers.in_parts(sections)

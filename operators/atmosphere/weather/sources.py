@@ -53,7 +53,8 @@ PRESSURE_MIN = 1e-3
 """Pa: that of 95 km. Below, the share of water that a humidity gives is not a number one can work
 with.
 """
-CURE, SORT = "check the unit of the column", "sort the rows from the ground up"
+CURE = "check the unit of the column"
+SORT = "sort the rows from the ground up"
 
 
 class Table(WeatherSource):
@@ -101,7 +102,8 @@ class Table(WeatherSource):
             for name, unit in UNITS.items()
             if name in REQUIRED or name in table.columns
         }
-        height, pressure = read["height"], read["pressure"]
+        height = read["height"]
+        pressure = read["pressure"]
         low = f"the pressure is below {PRESSURE_MIN:g} Pa"
         table.note_rows(np.diff(height, prepend=-np.inf) <= 0, "the height does not increase", SORT)
         table.note_rows(pressure < PRESSURE_MIN, low, "leave the row out: no air")
@@ -109,7 +111,8 @@ class Table(WeatherSource):
         table.note_rows(np.diff(pressure, prepend=np.inf) >= 0, falls, CURE)
         table.check()
         temperature = read["temperature"] + offset
-        humidity, kind = read[kinds[0]], kinds[0]
+        humidity = read[kinds[0]]
+        kind = kinds[0]
         calm = not winds
         wind = wind_speed(np.maximum(height - site.altitude, 0.0)), np.zeros_like(height)
         h2o = humidity
@@ -137,7 +140,8 @@ class Table(WeatherSource):
     @staticmethod
     def _check(table: table_files.Table, column: Column, kind: str, humidity: Floats) -> None:
         """Note levels that no air has."""
-        height, faults = column.height, list(impossible(column))
+        height = column.height
+        faults = list(impossible(column))
         if kind == "relative humidity":
             faults.append((humidity > 1.2, f"the {kind} is above 120 %"))
             if 0 < humidity.max() <= DRY_AIR:
@@ -246,8 +250,10 @@ def on_the_ground(profile: Profile, time: Instant, wind: AnyFloats | None = None
     """Readings of instruments at the telescope; ``wind`` (east, north) [m/s] if it is not the
     profile's.
     """
-    ground, air = profile.at(0.0), profile.at(10.0)
-    vapour, temperature = float(air.vapour_density), float(air.temperature)
+    ground = profile.at(0.0)
+    air = profile.at(10.0)
+    vapour = float(air.vapour_density)
+    temperature = float(air.temperature)
     dry = (float(air.pressure) - vapour * VAPOUR_GAS_CONSTANT * temperature) / (
         DRY_AIR_GAS_CONSTANT * temperature
     )
@@ -293,12 +299,14 @@ def _scaled(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profil
             place="weather",
             cure="give the PWV in mm, or leave it away to take the source's own",
         )
-    quantile, drawn = given.quantile, ""
+    quantile = given.quantile
+    drawn = ""
     if quantile is None:
         quantile = float(uniforms(stream_key(seed, "weather", "pwv"), 0, 1)[0])
         drawn = " (drawn)"
     wanted = law.at(quantile)
-    low, high = law.at(0.25) * 1e3, law.at(0.75) * 1e3
+    low = law.at(0.25) * 1e3
+    high = law.at(0.75) * 1e3
     text = f"{wanted * 1e3:.4g} mm, the {100 * quantile:.4g} % quantile{drawn}"
     season = (
         f"of that season and hour: median {law.median * 1e3:.4g} mm, half the days between"
@@ -315,10 +323,8 @@ def _blown(profile: Profile, weather: WeatherSource, seed: int) -> tuple[Profile
     if weather.wind == "typical":
         return profile.typical_wind, "median speed along the median direction"
     z = [float(x) for x in normals(stream_key(seed, "weather", "wind"), 0, 2)]
-    east, north = (
-        profile.wind_east + z[0] * profile.wind_east_spread,
-        profile.wind_north + z[1] * profile.wind_north_spread,
-    )
+    east = profile.wind_east + z[0] * profile.wind_east_spread
+    north = profile.wind_north + z[1] * profile.wind_north_spread
     return (
         replace(profile, wind_east=east, wind_north=north),
         f"drawn: medians {z[0]:+.2f}, {z[1]:+.2f} spreads (east, north)",

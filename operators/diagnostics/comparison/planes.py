@@ -173,7 +173,8 @@ class Plane:
             values, noise = _of_neighbours(self, other.grid)
         else:
             x, y = positions(other.grid, self.grid)
-            values, noise = _sampled(self.values, x, y, 3), None
+            values = _sampled(self.values, x, y, 3)
+            noise = None
             if self.noise is not None:
                 noise = np.sqrt(_sampled(self.noise**2, x, y, 1))
                 noise = noise * _kept(x, y, self.blurred, self.grid.sides)
@@ -341,7 +342,9 @@ def common(
     InputError
         ``fwhm`` is less than one of the two; the maps have no pixel with a value in common.
     """
-    target, notes, made = common_beam(reference, other) if fwhm is None else fwhm, [], []
+    target = common_beam(reference, other) if fwhm is None else fwhm
+    notes = []
+    made = []
     for plane in (reference, other):
         if not np.isfinite(plane.values).any():
             raise InputError(EMPTY, place=plane.name, cure=NOT_EMPTY)
@@ -357,7 +360,8 @@ def common(
             before = f"from {angle_text(plane.fwhm)} " if plane.fwhm else ""
             notes.append(f"{plane.name}: smoothed {before}to {angle_text(target)}")
     stays = int(_is_the_grid(made[1], made[0]))
-    grid, own = made[stays], made[1 - stays]
+    grid = made[stays]
+    own = made[1 - stays]
     made[1 - stays] = own.onto(grid)
     first, second = made
     if not (np.isfinite(first.values) & np.isfinite(second.values)).any():
@@ -441,8 +445,10 @@ def _is_the_grid(second: Plane, first: Plane) -> bool:
 def _how(grid: Plane, own: Plane) -> str:
     """The way in which a map comes to a grid, in words."""
     if own.pixels is not None:
-        same, how = _same_pixels(grid.pixels, own.pixels), "interpolated between four neighbours"
+        same = _same_pixels(grid.pixels, own.pixels)
+        how = "interpolated between four neighbours"
     else:
         x, y = positions(grid.grid, own.grid)
-        same, how = _whole(x, y, np.isfinite(x) & np.isfinite(y)), "interpolated by cubic splines"
+        same = _whole(x, y, np.isfinite(x) & np.isfinite(y))
+        how = "interpolated by cubic splines"
     return "on the same pixels" if same else how

@@ -99,7 +99,8 @@ class Rings:
         size = window.shape[::-1]
         waves = np.stack(np.meshgrid(*(np.fft.fftfreq(n, 1 / n) for n in size)))  # along x and y
         east, self.north = np.tensordot(np.linalg.inv(cell(steps) * size).T, waves, 1)
-        self.west, self.count = -east, len(edges) - 1
+        self.west = -east
+        self.count = len(edges) - 1
         self.k = np.hypot(self.north, self.west)
         ring = np.searchsorted(edges, self.k, "right") - 1
         self.ring = np.where((ring >= 0) & (ring < self.count), ring, self.count).ravel()
@@ -107,7 +108,8 @@ class Rings:
 
     def transform(self, values: Floats) -> NDArray[np.complex128]:
         """Fourier transform of w (m - <m>_w)."""
-        w, m = self.window, np.where(self.window != 0, values, 0.0)
+        w = self.window
+        m = np.where(self.window != 0, values, 0.0)
         mean = (m * w).sum() / w.sum() if w.any() else 0.0
         return np.asarray(np.fft.fft2((m - mean) * w), np.complex128)
 
@@ -202,7 +204,8 @@ def ring_edges(shape: tuple[int, int], steps: float | Floats, bins: int) -> Floa
     modes of the longer side of the map are apart.
     """
     sides = lengths(steps)
-    step, highest = 1 / float((sides * shape).max()), 0.5 / float(sides.max())
+    step = 1 / float((sides * shape).max())
+    highest = 0.5 / float(sides.max())
     edges = [0.75 * step]
     ratio = (highest / edges[0]) ** (1 / bins)
     while edges[-1] < highest * (1 - 1e-9) and len(edges) <= bins:
@@ -239,16 +242,19 @@ def radial_spectra(
         and NAME_B, equation (3), whose noise is the mean of both, and the cross spectra NAME_TE,
         NAME_TB and NAME_EB (T where there is an I).
     """
-    rings, polarized = Rings(maps.values(), window, steps, edges), polarized or {}
+    rings = Rings(maps.values(), window, steps, edges)
+    polarized = polarized or {}
     w = rings.window
     square = float((w**2).sum())
     area = abs(float(np.linalg.det(cell(steps)))) / square if square else math.nan
     waves = {name: rings.transform(values) for name, values in maps.items()}
     pairs: dict[str, tuple[str, str]] = {}
     angle = 2 * np.arctan2(rings.west, rings.north)
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     for name, (q, u) in polarized.items():
-        q_k, u_k = waves.pop(q), waves.pop(u)
+        q_k = waves.pop(q)
+        u_k = waves.pop(u)
         waves[f"{name}_E"] = q_k * cosine + u_k * sine
         waves[f"{name}_B"] = u_k * cosine - q_k * sine
         letters = {"T": name, "E": f"{name}_E", "B": f"{name}_B"}
@@ -272,10 +278,12 @@ def radial_spectra(
             name: mean(_of_noise(error, steps, smoothing))
             for name, error in zip(noise or {}, errors, strict=True)
         }
-        modes, draws = rings.number / 2 / correlation(weighed), None
+        modes = rings.number / 2 / correlation(weighed)
+        draws = None
         if smoothing and white:
             passed = np.exp(-((2 * np.pi * rings.k * smoothing) ** 2) / 2)
-            own, rng = next(iter(white.values())), np.random.default_rng(1)
+            own = next(iter(white.values()))
+            rng = np.random.default_rng(1)
             passed /= math.sqrt(float((passed**2).mean()))
             drawn = []
             for _ in range(DRAWS):  # noise like equation (2)'s
@@ -334,10 +342,13 @@ def profiles(
     """
     finite = [np.isfinite(values) for values in (*maps.values(), distance)]
     known = np.logical_and.reduce([*finite, areas > 0])
-    ring, weight = (distance[known] / width).astype(np.int64), areas[known]
-    number, covered = np.bincount(ring), np.bincount(ring, weight)
+    ring = (distance[known] / width).astype(np.int64)
+    weight = areas[known]
+    number = np.bincount(ring)
+    covered = np.bincount(ring, weight)
     independent = np.maximum(np.minimum(number, covered / beam_area if beam_area else np.inf), 1.0)
-    mean, error = {}, {}
+    mean = {}
+    error = {}
     for name, values in maps.items():
         with np.errstate(invalid="ignore", divide="ignore"):
             first = np.bincount(ring, weight * values[known]) / covered

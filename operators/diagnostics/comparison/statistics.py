@@ -113,9 +113,11 @@ def compare(
         `COMPLETE` of the circle has values.
     """
     a, b, notes = common(reference, other, fwhm)
-    centre, names = _centre(a), (reference.name, other.name)
+    centre = _centre(a)
+    names = (reference.name, other.name)
     a, b = _cropped(a, b)
-    grid, both = a.grid, np.isfinite(a.values) & np.isfinite(b.values)
+    grid = a.grid
+    both = np.isfinite(a.values) & np.isfinite(b.values)
     planes = {
         "reference": np.where(both, a.values, np.nan),
         "map": np.where(both, b.values, np.nan),
@@ -135,7 +137,8 @@ def compare(
                 )
                 noise[name] = plane.noise_in_words, plane.factor
                 notes.append(f"noise of the {of}: {plane.noise_in_words}")
-    pixel, width = a.pixel, max(a.fwhm or 0.0, b.fwhm or 0.0)
+    pixel = a.pixel
+    width = max(a.fwhm or 0.0, b.fwhm or 0.0)
     maps = {name: planes[name] for name in ("reference", "map", "difference")}
     found = profiles(maps, grid.distance(centre), areas, max(pixel, width / 2), beam_area(width))
     noisy = [plane for plane in (a, b) if plane.noise is not None and not plane.quiet]
@@ -164,7 +167,8 @@ def compare(
         header, planes = on_a_plane(a.pixels, planes)
         maps = {name: planes[name] for name in maps}
     flat = image_grid(header, planes["map"].shape)
-    cell, known = cell_of(flat), np.isfinite(planes["map"])
+    cell = cell_of(flat)
+    known = np.isfinite(planes["map"])
     spectra = radial_spectra(maps, tapered(known, cell), cell, ring_edges(known.shape, cell, bins))
     areas = np.broadcast_to(flat.areas, flat.shape)[known & np.isfinite(flat.areas)]
     if areas.size and areas.max() > (1 + UNEVEN) * areas.min():
@@ -252,7 +256,8 @@ def _centre(plane: Plane) -> tuple[float, float]:
     ny, nx = grid.shape
     x, y = (float(plane.header.get(key, 0.0)) - 1 for key in ("CRPIX1", "CRPIX2"))
     if not (grid.kind in ZENITHAL and 0 <= x < nx and 0 <= y < ny):
-        x, y = (nx - 1) / 2, (ny - 1) / 2
+        x = (nx - 1) / 2
+        y = (ny - 1) / 2
     middle = grid.at(x, y)
     if not np.isfinite(middle).all():  # a corner of the projection that is not on the sky
         middle = np.nanmean(grid.directions()[np.isfinite(plane.values)], axis=0)
@@ -279,11 +284,14 @@ def values_of(
     """
     weight = np.ones(a.shape) if weights is None else weights
     both = np.isfinite(a) & np.isfinite(b) & (weight > 0)
-    x, y, w = a[both], b[both], weight[both] / weight[both].sum()
+    x = a[both]
+    y = b[both]
+    w = weight[both] / weight[both].sum()
     found: dict[str, float] = {}
     for name, values in (("reference", x), ("map", y), ("difference", y - x)):
         found[f"mean {name}"], found[f"rms {name}"] = float((w * values).sum()), rms(values, w)
-    u, v = x - found["mean reference"], y - found["mean map"]
+    u = x - found["mean reference"]
+    v = y - found["mean map"]
     scatter = rms(u, w) * rms(v, w)
     found["correlation"] = float((w * u * v).sum() / scatter) if scatter > 0 else math.nan
     where: Any = np.indices(a.shape, np.float64) if places is None else places
