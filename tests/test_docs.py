@@ -286,7 +286,7 @@ def with_what_fragments_read(folder, text):
 
 
 def without_pixels(figure, file, **settings):
-    """In place of `Figure.savefig`, half of a run's CPU: pictures are made, their pixels are not."""
+    """In place of `Figure.savefig`, a third of a run's CPU: no pixels are made of a picture."""
     if isinstance(file, str | Path):
         Path(file).touch()
 
