@@ -16,14 +16,13 @@ from zonda.core.numerics.chunks import TILE_SAMPLES
 from zonda.core.signal import MAIN
 from zonda.core.types import AnyFloats, Floats
 
-from .baseline_noise import BaselineNoise, estimate, filled, members
+from .baseline_noise import BaselineNoise, estimate, filled, members, of_scene, of_table
 from .bin_map import Prepared
 from .binning import Weights, binnings
 from .compressed_scan import RunsOfTiles, Tile, add_baselines, add_groups
 from .intensity_kernel import VALUE, WEIGHT
 from .normal_equations import Compressed
 from .parameters import LikelihoodParameters
-from .stated_noise import of_scene, of_table
 
 if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable

@@ -256,6 +256,16 @@ class LikelihoodParameters(MapParameters):
             raise ValueError(f"{value} belongs to BinMap; write estimated or simulated")
         return value
 
+    @model_validator(mode="before")
+    @classmethod
+    def _no_mask(cls, values: Any) -> Any:
+        if isinstance(values, dict) and "mask" in values:
+            raise ValueError(
+                "a mask belongs to filters: nothing is filtered here, and the noise is estimated"
+                " from data minus the map (refine)"
+            )
+        return values
+
     patterns: int = Field(0, ge=0, le=10)
     """How many of the patterns that the data determine least are found and become planes of the
     map, with their pictures. Finding them may take as long as the map, or several times as long."""

@@ -369,6 +369,7 @@ def test_what_was_taken_off_is_that_of_i():
         ({"noise": "simulated", "group": "all"}, "group: all"),
         ({"noise": "no_such_table.ecsv"}, "no_such_table"),
         ({"contents": "hits"}, "BinMap"),
+        ({"mask": {"radius": "1 arcmin"}}, "belongs to filters"),
         ({"half_difference": "detectors"}, "half_difference"),
         ({"nside": 1024, "undetermined": "plane"}, "undetermined"),
     ],
@@ -518,6 +519,27 @@ def test_gaps_of_some_detectors_leave_the_noise_as_it_is(gaps):
     # with the walk in the means of the samples that are there, single gaps had 2.9 times, chi^2 0.1
     assert np.nanmedian(found.noise * np.sqrt(found.hits)) == pytest.approx(SIGMA, rel=0.05)
     assert found.chi2[0] == pytest.approx(1, abs=0.1)
+
+
+def test_a_mask_of_the_source_leaves_the_noise_as_it_is():
+    """Samples within 2 arcmin of the middle, 16 % of all and at other times of each detector, do not
+    count: a source there changes no bit, and the noise is that of the map without a mask."""
+    o, rng = observation(), np.random.default_rng(17)
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(37, o.n_samples))
+    grid = grid_of(o, pixel="15 arcsec")
+    at = np.divmod(Looking.of(o, grid).pixels(np.arange(37), 0, o.n_samples), grid.shape[1])
+    r = np.hypot(*(x - (n - 1) / 2 for x, n in zip(at, grid.shape, strict=True))) * 15 / 60
+    inside = r < 2
+    assert 0.1 < inside.mean() < 0.2
+    source = 100 * SIGMA * np.where(inside, np.exp(-(r**2)), 0.0)
+    none, seen = (mapped(o, np.where(inside, np.nan, noise + k * source)) for k in (0, 1))
+    np.testing.assert_array_equal(none.signal, seen.signal)
+    whole = mapped(o, noise)
+    assert excess(seen) == pytest.approx(excess(whole), rel=0.1)
+    assert seen.chi2[0] == pytest.approx(whole.chi2[0], abs=0.03)
+    # levels as those of gaps above
+    level = np.nanmedian(seen.noise * np.sqrt(seen.hits))
+    assert level == pytest.approx(np.nanmedian(whole.noise * np.sqrt(whole.hits)), rel=0.03)
 
 
 @pytest.mark.parametrize("gaps", [False, True])
