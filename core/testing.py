@@ -492,9 +492,12 @@ def _small(operator: Operator) -> int:
 
 
 def _comparable(product: Any) -> Any:
-    """Arrays inside a product, by name; texts are left out (they hold paths and times)."""
+    """Arrays inside a product, by name; texts are left out (they hold paths and times), and fields
+    with ``compare=False``.
+    """
     if dataclasses.is_dataclass(product):
-        return {f.name: _comparable(getattr(product, f.name)) for f in dataclasses.fields(product)}
+        names = [f.name for f in dataclasses.fields(product) if f.compare]
+        return {name: _comparable(getattr(product, name)) for name in names}
     if isinstance(product, Mapping):
         return {k: _comparable(v) for k, v in product.items()}
     return product if isinstance(product, np.ndarray | int | float) else None

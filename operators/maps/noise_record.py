@@ -55,7 +55,7 @@ class NoiseRecord:
     tolerance: float
     label: str
     noise: str
-    work: Work = field(default_factory=Work)
+    work: Work = field(default_factory=Work, compare=False)
 
     def tables(self) -> dict[str, list[Column]]:
         """Spectra and power of the modes of each scan, residuals and Ritz values."""
