@@ -389,7 +389,11 @@ def noise_weight(
         text = f"the scan has {n_good} detectors and {scan.n_samples} samples"
         cure = "give the observation that was compressed"
         raise InputError(text, place="zonda.linear.noise_weight", cure=cure)
-    pixel = np.repeat(scan.pixel, scan.samples).reshape(n_good, -1)
+    parts = [
+        np.repeat(pixel[first[0] : first[-1]], samples[first[0] : first[-1]])
+        for _, (first, pixel, samples, *_) in scan.parts()
+    ]
+    pixel = np.concatenate(parts).reshape(n_good, -1)
     counts, gaps = pixel < scan.width, (pixel >= scan.n_pixels) & (pixel < scan.width)
     starts, a = np.arange(n_base) * scan.length, noise.free_modes
     of = np.repeat(np.arange(n_base), scan.length)[: scan.n_samples]

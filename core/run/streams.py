@@ -13,6 +13,7 @@ segment or an `Operator.measure` reads. A rule decides, which knows sizes and co
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import tempfile
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..data import Observation, Stream
 from ..errors import OutputError, PipelineError
@@ -182,6 +184,10 @@ class Files:
 
     room: int
 
+    def hold(self, size: int) -> bool:
+        """Tell whether ``size`` bytes of a product fit in memory or on the disk."""
+        return size <= max(self.room, free_disk())
+
     def needed(self, size: int, place: str, cure: str) -> bool:
         """Tell whether ``size`` bytes of a product go into files; else they take their room.
 
@@ -210,19 +216,30 @@ class Files:
             return {key: self.put(value) for key, value in tree.items()}
         if isinstance(tree, list | tuple):
             return [self.put(value) for value in tree]
-        if not isinstance(tree, np.ndarray) or tree.nbytes < LEAST_FILE:
+        there = isinstance(tree, np.memmap)
+        if there or not isinstance(tree, np.ndarray) or tree.nbytes < LEAST_FILE:
             return tree
-        with tempfile.TemporaryFile(prefix="zonda-") as file:
-            try:
-                _reserve(file.fileno(), tree.nbytes)
-            except OSError as error:
-                raise _no_room(tree.nbytes, error) from error
-            array = np.memmap(file, tree.dtype, "r+", shape=tree.shape)
+        array = in_file(tree.shape, tree.dtype)
         to, of = array.reshape(-1), tree.reshape(-1)
         for start in range(0, of.size, AT_A_TIME):
             to[start : start + AT_A_TIME] = of[start : start + AT_A_TIME]
             forget_pages(array)
         return array
+
+
+def in_file(shape: Any, dtype: Any) -> NDArray[Any]:
+    """An array of zeros in a temporary file without a name, memory-mapped. Raises OutputError where
+    the disk is full.
+    """
+    size = math.prod(np.atleast_1d(shape).tolist()) * np.dtype(dtype).itemsize
+    if not size:
+        return np.zeros(shape, dtype)
+    with tempfile.TemporaryFile(prefix="zonda-") as file:
+        try:
+            _reserve(file.fileno(), size)
+        except OSError as error:
+            raise _no_room(size, error) from error
+        return np.memmap(file, dtype, "r+", shape=shape)
 
 
 def _no_room(size: int, error: OSError) -> OutputError:

@@ -20,25 +20,98 @@ lie in one further pixel, and add nothing.
 A polarized run sees v = I + c Q + s U with the means of c and s (`core.polarization`) over it;
 where the angle turns within a run (a half-wave plate), each sample is a run of its own.
 
-Runs end at baselines and at multiples of `TILE_SAMPLES`: they depend on no block.
+Runs end at baselines and at multiples of `TILE_SAMPLES`: they depend on no block. They follow from
+pointing and flags, and from samples that are not finite, of which a list is kept. They are found
+once, and kept in memory or in files; or anew whenever they are needed, with the same bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.kernels import kernel
-from zonda.core.numerics.chunks import chunks
-from zonda.core.stream import forget_pages
+from zonda.core.numerics.chunks import TILE_SAMPLES, chunks
+from zonda.core.run.streams import in_file
+from zonda.core.stream import forget_pages, in_order
 from zonda.core.types import Floats
 
 PART = 1 << 25
 """Bytes of runs in files that are worked on at a time."""
+FOUND = 1 << 22
+"""Bytes of pixels and runs that are found at a time: they stay in the cache."""
+Runs = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.uint16], Floats]
+"""The first run of each baseline, and pixel, samples and angles of each run."""
+
+
+class Keeps(IntEnum):
+    """Where runs are kept; or nowhere, and found anew."""
+
+    MEMORY = 0
+    FILES = 1
+    AGAIN = 2
+
+
+@dataclass(frozen=True)
+class RunsOfPointing:
+    """Finds the runs of detectors, with the same bits each time.
+
+    Attributes
+    ----------
+    find
+        Of some detectors (a slice) pixels (n, n_samp) int32, -1 where a sample does not count, and
+        c and s (n, n_samp), or (n, 0) for maps of I.
+    length
+        Samples of a baseline.
+    have
+        (n_samp,) instants at which a sample of some detector counts.
+    gap
+        (n_det,) first gap of each detector; -1 for detectors without samples.
+    n_pixels, left_out
+        Pixel of the first gap, and of samples that are left out.
+    single
+        Each sample is a run.
+    """
+
+    find: Callable[[slice], tuple[NDArray[np.int32], Floats, Floats]]
+    length: int
+    have: NDArray[np.bool_]
+    gap: NDArray[np.int64]
+    n_pixels: int
+    left_out: int
+    single: bool
+
+    def parts(self, threads: int = 1) -> Iterator[tuple[slice, Runs]]:
+        """Detectors and their runs, some at a time."""
+        rows = max(FOUND // (10 * self.have.size), 1)
+        yield from in_order(self._part, ((some,) for some in chunks(self.gap.size, rows)), threads)
+
+    def _part(self, some: slice) -> tuple[slice, Runs]:
+        return some, self.of(*self.find(some), self.gap[some])
+
+    def of(
+        self, pixel: NDArray[np.int32], cosine: Floats, sine: Floats, gap: NDArray[np.int64]
+    ) -> Runs:
+        """Runs of detectors with these pixels and angles."""
+        first = np.empty(len(gap) * -(-self.have.size // self.length) + 1, np.int64)
+        found, size = np.empty(pixel.size, np.int32), np.empty(pixel.size, np.uint16)
+        angles = np.empty((2, cosine.size))
+        k = _find_runs(
+            pixel, cosine, sine, self.length, self.have, gap, self.n_pixels, self.left_out,
+            self.single, found, size, angles, first,
+        )  # fmt: skip
+        return first, found[:k], size[:k], angles[:, :k]
+
+    def left(self) -> tuple[int, int]:
+        """Runs that are left out of a detector with samples, and of one without."""
+        nothing, none = np.full((1, self.have.size), -1, np.int32), np.zeros((1, 0))
+        some, without = (len(self.of(nothing, none, none, np.array([gap]))[1]) for gap in (0, -1))
+        return some - int(np.count_nonzero(self.have)), without
 
 
 @dataclass
@@ -65,6 +138,8 @@ class CompressedScan:
     within
         (n_det,) sum of the squares of the complete signal's samples about the means of their
         baselines, K^2.
+    again
+        Finds runs that are not kept.
     """
 
     length: int
@@ -79,6 +154,7 @@ class CompressedScan:
     known: NDArray[np.int32]
     angles: Floats = field(default_factory=lambda: np.zeros((2, 0)))
     within: Floats = field(default_factory=lambda: np.zeros(0))
+    again: RunsOfPointing | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -99,7 +175,8 @@ class CompressedScan:
     def nbytes(self) -> int:
         """Bytes that it holds."""
         every = self.pixel, self.samples, self.first, self.counted, self.angles
-        return sum(array.nbytes for array in every) + (self.known.nbytes if self.gaps else 0)
+        more = self.known.nbytes if self.gaps else 0
+        return sum(array.nbytes for array in every) + more
 
     def seen(self, m: Floats, a: Floats) -> tuple[Floats, Floats]:
         """(Y m (n_det, n_base), S m (k, n_samp)) of a map m (1 or 3, width), equations (1) and
@@ -108,8 +185,8 @@ class CompressedScan:
         y, m = np.empty(self.shape), np.ascontiguousarray(m)
         modes = a if len(a) else np.zeros((1, len(y)))
         steps = np.zeros((len(modes), self.n_samples + 1))
-        for k, (mode, row) in enumerate(zip(modes, steps, strict=True)):
-            for some, runs in self._parts():
+        for some, runs in self.parts():
+            for k, (mode, row) in enumerate(zip(modes, steps, strict=True)):
                 _see(*runs, m, mode[some], k > 0, y[some], row)
         return y, np.cumsum(steps[: len(a)], axis=1)[:, :-1]
 
@@ -120,13 +197,15 @@ class CompressedScan:
         np.cumsum(s, axis=1, out=running[: len(a), 1:])
         for k, (mode, row) in enumerate(zip(modes, running, strict=True)):
             own = np.zeros_like(y) if k else np.ascontiguousarray(y)
-            for some, runs in self._parts():
+            for some, runs in self.parts():
                 _spread(*runs, self.length, mode[some], k > 0, own[some], row, out)
 
     def about_means(self, s: Floats, y: Floats, a: Floats) -> Floats:
         """Equation (2) from s' = sum_d a_kd d_d(t) (k, n_samp) of the samples that count."""
         steps = np.zeros((len(a), self.n_samples + 1))
-        _lower(self.first, self.pixel, self.samples, self.counted, self.n_pixels, a, y, steps)
+        for some, (first, pixel, samples, _, counted) in self.parts():
+            lowered = np.ascontiguousarray(a[:, some]), np.ascontiguousarray(y[some])
+            _lower(first, pixel, samples, counted, self.n_pixels, *lowered, steps)
         return np.asarray(s + np.cumsum(steps, axis=1)[:, :-1])
 
     def over(self, c: Floats) -> Floats:
@@ -134,27 +213,33 @@ class CompressedScan:
         there.
         """
         running, out = np.concatenate([[0.0], np.cumsum(c)]), np.zeros(self.shape)
-        _over(self.first, self.pixel, self.samples, self.n_pixels, running, out)
+        for some, (first, pixel, samples, *_) in self.parts():
+            _over(first, pixel, samples, self.n_pixels, running, out[some])
         return out
 
     def weigh(self, weight: Floats, out: Floats) -> None:
         """Add each detector's ``weight`` (n_det,) at its samples to the weights ``out`` (1 or 6,
         width) of I, or of I, Q and U: ii, iq, iu, qq, qu, uu.
         """
-        for some, runs in self._parts():
+        for some, runs in self.parts():
             _weigh(*runs, weight[some], out)
 
     def in_gaps(self, y: Floats) -> Floats:
         """(gaps,) of each gap its baseline's value of y (n_det, n_base)."""
         out = np.empty(self.gaps)
-        for some, (first, pixel, *_) in self._parts() if self.gaps else ():
+        for some, (first, pixel, *_) in self.parts() if self.gaps else ():
             _in_gaps(first, pixel, self.n_pixels, y[some], out)
         return out
 
-    def _parts(self) -> Iterator[tuple[slice, tuple[Any, ...]]]:
-        """Detectors and their runs, as kernels take them: all of them, or of runs in files some at
-        a time, whose pages are given back. Sums over detectors go on from part to part.
+    def parts(self) -> Iterator[tuple[slice, tuple[Any, ...]]]:
+        """Detectors and their runs, as kernels take them: all of them; some at a time of runs in
+        files, whose pages are given back, and of those that are found anew. Sums over detectors go
+        on from part to part.
         """
+        if self.again is not None:
+            for some, runs in self.again.parts():
+                yield some, (*runs, self.counted[some])
+            return
         every = self.first, self.pixel, self.samples, self.angles, self.counted
         n_det, n_base = self.shape
         in_files = isinstance(self.pixel, np.memmap)
@@ -168,7 +253,7 @@ class CompressedScan:
 
 
 class RunsOfTiles:
-    """Collects the runs of tiles as they are found, in order of time for each detector.
+    """Adds up tiles as they are found, in baselines, and counts their runs.
 
     Parameters
     ----------
@@ -177,55 +262,79 @@ class RunsOfTiles:
     """
 
     def __init__(self, n_det: int, n_samples: int, length: int) -> None:
-        self.length, self.n_samples = length, n_samples
+        self.length, self.n_samples, self.number = length, n_samples, 0
         n_base = -(-n_samples // length)
-        self.number = np.zeros((n_det, n_base), np.int32)
         self.counted = np.zeros((n_det, n_base), np.int32)
         self.sums = np.zeros((n_det, n_base))
         self.squares = np.zeros((n_det, n_base))
-        self._tiles: list[tuple[NDArray[np.intp], Tile]] = []
+        self.have = np.zeros(n_samples, np.bool_)
+        self._lost = [np.zeros((0, 2), np.intp)]
 
     def add(self, rows: NDArray[np.intp], tile: Tile) -> None:
         """Add a tile of the good detectors ``rows``."""
-        here = slice(tile.base, tile.base + tile.number.shape[1])
-        self.number[rows, here] += tile.number
+        here = slice(tile.base, tile.base + tile.counted.shape[1])
         self.counted[rows, here] += tile.counted
         self.sums[rows, here] += tile.sums
         self.squares[rows, here] += tile.squares
-        self._tiles.append((rows, tile))
+        self.have[tile.start : tile.start + tile.have.size] |= tile.have
+        self.number += tile.number
+        self._lost.append(tile.lost)
 
-    def scan(self, rate: float, n_pixels: int) -> CompressedScan:
-        """Runs of all tiles, detector by detector; the tiles are used up."""
-        first = np.zeros(self.number.size + 1, np.int64)
-        np.cumsum(self.number.ravel(), out=first[1:])
-        at = first[:-1].reshape(self.number.shape)[:, 0].copy()
-        polarized = bool(self._tiles) and self._tiles[0][1].angles.shape[1] > 0
-        pixel, samples = np.empty(first[-1], np.int32), np.empty(first[-1], np.uint16)
-        angles = np.empty((2, first[-1] if polarized else 0))
-        while self._tiles:
-            rows, tile = self._tiles.pop(0)
-            begin = 0
-            for row, number in zip(rows, tile.number.sum(axis=1), strict=True):
-                to, of = slice(at[row], at[row] + number), slice(begin, begin + number)
-                pixel[to], samples[to] = tile.pixel[of], tile.samples[of]
-                if polarized:
-                    angles[:, to] = tile.angles[:, of]
-                at[row] += number
-                begin += number
-        runs = first, pixel, samples, angles, self.counted, n_pixels
-        have = np.zeros(self.n_samples, np.bool_)
-        _have(*runs, have)
-        n_runs, gaps = _with_gaps(*runs, have, 0, pixel[:0], samples[:0], angles[:, :0], first[:0])
-        more, counted = first, self.counted
+    @property
+    def lost(self) -> NDArray[np.intp]:
+        """(n, 2) detector and instant of samples without a value, in order."""
+        found = np.concatenate(self._lost)
+        return found[np.lexsort(found.T[::-1])]
+
+    def scan(
+        self,
+        rate: float,
+        n_pixels: int,
+        find: Callable[[slice], tuple[NDArray[np.int32], Floats, Floats]],
+        *,
+        polarized: bool = False,
+        single: bool = False,
+        keeps: Keeps = Keeps.MEMORY,
+        threads: int = 1,
+    ) -> CompressedScan:
+        """The scan; ``find``, ``single`` as of `RunsOfPointing`."""
+        keep, empty = keeps is not Keeps.AGAIN, in_file if keeps is Keeps.FILES else np.empty
+        known = self.counted.sum(axis=1)
+        lacking = np.where(known > 0, np.count_nonzero(self.have) - known, 0)
+        gaps, counted = int(lacking.sum()), self.counted
         if gaps:
-            longer = np.empty(n_runs, np.int32), np.empty(n_runs, np.uint16)
-            wide, more = np.zeros((2, n_runs if polarized else 0)), np.zeros_like(first)
-            _with_gaps(*runs, have, n_pixels + gaps, *longer, wide, more)
-            (pixel, samples), angles, counted = longer, wide, self.counted.copy()
-            _count(more, pixel, samples, n_pixels + gaps, counted)
+            have = np.add.reduceat(self.have, np.arange(0, self.n_samples, self.length), dtype=int)
+            counted = np.where(known[:, None] > 0, have, 0).astype(np.int32)
+        runs = RunsOfPointing(
+            find,
+            self.length,
+            self.have,
+            np.where(known > 0, np.cumsum(lacking) - lacking, -1),
+            n_pixels,
+            n_pixels + gaps,
+            single,
+        )
+        out, without = runs.left()
+        number = self.number + gaps + np.where(known > 0, out, without).sum() if keep else 0
+        pixel: Any = empty(number, np.int32)
+        samples: Any = empty(number, np.uint16)
+        angles: Any = empty((2, number if polarized else 0), np.float64)
+        first = np.zeros(counted.size + 1 if keep else 0, np.int64)
+        begin = 0
+        for some, (ends, found, size, seen) in runs.parts(threads) if keep else ():
+            to = slice(begin, begin + found.size)
+            first[some.start * counted.shape[1] :][: ends.size] = begin + ends
+            pixel[to], samples[to] = found, size
+            if polarized:
+                angles[:, to] = seen
+            for array in (pixel, samples, angles):
+                forget_pages(array)
+            begin = to.stop
         sizes = self.length, rate, self.n_samples, n_pixels, gaps
-        within = self.about.sum(axis=1)
-        return CompressedScan(*sizes, pixel, samples, more, counted, self.counted, angles, within)
+        within, again = self.about.sum(axis=1), None if keep else runs
+        return CompressedScan(
+            *sizes, pixel, samples, first, counted, self.counted, angles, within, again
+        )
 
     @property
     def about(self) -> Floats:
@@ -258,19 +367,19 @@ class RunsOfTiles:
 
 @dataclass(frozen=True)
 class Tile:
-    """Runs of some detectors in one tile: runs (n,), detector by detector, and the number of runs,
-    samples that count, their sum and their squares (n_det, n_base) in the baselines from ``base``
-    on.
+    """Some detectors in one tile: samples that count, their sum and their squares (n_det, n_base)
+    in the baselines from ``base`` on; instants (n,) from ``start`` on at which a sample counts; the
+    number of runs; and samples ``lost`` (k, 2), detector of the scan and instant, without a value.
     """
 
     base: int
-    pixel: NDArray[np.int32]
-    samples: NDArray[np.uint16]
-    number: NDArray[np.int32]
+    start: int
     counted: NDArray[np.int32]
     sums: Floats
     squares: Floats
-    angles: Floats
+    have: NDArray[np.bool_]
+    number: int
+    lost: NDArray[np.intp]
 
     @classmethod
     def of(
@@ -279,138 +388,92 @@ class Tile:
         pixel: NDArray[np.int32],
         start: int,
         length: int,
-        nowhere: int,
-        cosine: Floats,
-        sine: Floats,
         single: bool,
+        lost: NDArray[np.intp],
     ) -> Tile:
-        """Find the runs of samples from ``start`` on.
-
-        Parameters
-        ----------
-        signal
-            (n_det, n), K.
-        pixel
-            (n_det, n), -1 where a sample does not count.
-        nowhere
-            Number of the pixel of those.
-        cosine, sine
-            (n_det, n) c and s, or (n_det, 0).
-        single
-            Each sample is a run.
+        """Add up samples ``signal`` (n_det, n) [K] from ``start`` on, in ``pixel`` (n_det, n), -1
+        where a sample does not count; ``single``: each sample is a run.
         """
         n_det, n = pixel.shape
         base = start // length
         n_base = (start + n - 1) // length - base + 1
-        number, counted = np.zeros((2, n_det, n_base), np.int32)
+        counted, have = np.zeros((n_det, n_base), np.int32), np.zeros(n, np.bool_)
         sums, squares = np.zeros((2, n_det, n_base))
-        found, size = np.empty(pixel.size, np.int32), np.empty(pixel.size, np.uint16)
-        angles = np.zeros((2, pixel.size if cosine.shape[1] else 0))
-        k = _find(
-            signal, pixel, start, length, nowhere, cosine, sine, single, found, size, number,
-            counted, sums, squares, angles,
-        )  # fmt: skip
-        angles = angles[:, :k].copy()
-        return cls(base, found[:k].copy(), size[:k].copy(), number, counted, sums, squares, angles)
+        k = _add_up(signal, pixel, start, length, single, counted, sums, squares, have)
+        return cls(base, start, counted, sums, squares, have, k, lost)
 
 
 @kernel
-def _find(  # type: ignore[no-untyped-def]
-    signal, pixel, start, length, nowhere, cosine, sine, single, found, size, number, counted,
-    sums, squares, angles,
-):  # fmt: skip
-    """Find runs; returns their number."""
-    k = -1
-    polarized = cosine.shape[1] > 0
+def _add_up(  # type: ignore[no-untyped-def]
+    signal, pixel, start, length, single, counted, sums, squares, have
+):
+    """Add samples to baselines; returns the number of runs that count."""
+    k = 0
     for d in range(pixel.shape[0]):
-        last, before = -2, -1
+        last, before = -1, -1
         for i in range(pixel.shape[1]):
             p, b = pixel[d, i], (start + i) // length - start // length
-            if p != last or b != before or (single and p >= 0):
-                k += 1
-                found[k], size[k] = p if p >= 0 else nowhere, 0
-                number[d, b] += 1
-            size[k] += 1
             if p >= 0:
+                k += p != last or b != before or single
                 v = np.float64(signal[d, i])
                 counted[d, b] += 1
                 sums[d, b] += v
                 squares[d, b] += v * v
-                if polarized:
-                    angles[0, k] += cosine[d, i]
-                    angles[1, k] += sine[d, i]
+                have[i] = True
             last, before = p, b
-    if polarized:
-        for r in range(k + 1):
-            angles[0, r] /= size[r]
-            angles[1, r] /= size[r]
-    return k + 1
+    return k
 
 
 @kernel
-def _have(first, pixel, samples, angles, counted, nowhere, have):  # type: ignore[no-untyped-def]
-    """Note instants at which a sample of some detector counts."""
-    n_det, n_base = counted.shape
-    for d in range(n_det):
-        t = 0
-        for r in range(first[d * n_base], first[(d + 1) * n_base]):
-            if pixel[r] < nowhere:
-                have[t : t + samples[r]] = True
-            t += samples[r]
-
-
-@kernel
-def _with_gaps(  # type: ignore[no-untyped-def]
-    first, pixel, samples, angles, counted, nowhere, have, left_out, new, size, wide, begins
+def _find_runs(  # type: ignore[no-untyped-def]
+    pixel, cosine, sine, length, have, gap, nowhere, left_out, single, found, size, angles, first
 ):
-    """Runs in which each gap has a run of its own, of which the pixels are ``nowhere`` and those
-    that follow; of what is left out ``left_out``. Returns the numbers of runs and of gaps; without
-    place for runs it counts them alone.
-    """
-    n_det, n_base = counted.shape
-    k, gaps, write = 0, 0, new.size > 0
-    for d in range(n_det):
-        t, some = 0, counted[d].sum() > 0
-        for b in range(n_base):
-            for r in range(first[d * n_base + b], first[d * n_base + b + 1]):
-                begin = t
-                t += samples[r]
-                while begin < t:
-                    end = t
-                    gap = pixel[r] >= nowhere and some and have[begin]
-                    if gap:
-                        end = begin + 1
-                    elif pixel[r] >= nowhere and some:
-                        end = begin + 1
-                        while end < t and not have[end]:
-                            end += 1
-                    if write:
-                        size[k] = end - begin
-                        new[k] = pixel[r]
-                        if gap:
-                            new[k] = nowhere + gaps
-                        elif pixel[r] >= nowhere:
-                            new[k] = left_out
-                        elif wide.shape[1]:
-                            wide[0, k], wide[1, k] = angles[0, r], angles[1, r]
-                    gaps += gap
-                    k += 1
-                    begin = end
-            if write:
-                begins[d * n_base + b + 1] = k
-    return k, gaps
+    """Find runs, in which each gap has a run of its own; returns their number."""
+    n, k, b = pixel.shape[1], 0, 0
+    for d in range(pixel.shape[0]):
+        g, begin, base = gap[d], 0, 0
+        while begin < n:
+            if begin == base:
+                first[b] = k
+                b += 1
+                base += length
+            end = min(base, begin // TILE_SAMPLES * TILE_SAMPLES + TILE_SAMPLES, n)
+            last, since = -2, begin
+            for t in range(begin, end):
+                p = pixel[d, t]
+                if p == last and (not single if p >= 0 else g < 0 or not have[t]):
+                    continue
+                if t > since:
+                    size[k - 1] = t - since
+                last, since = p, t
+                found[k] = p
+                if p < 0:
+                    found[k] = left_out
+                    if g >= 0 and have[t]:
+                        found[k], last = nowhere + g, -2
+                        g += 1
+                k += 1
+            size[k - 1] = end - since
+            begin = end
+    first[b] = k
+    if cosine.shape[1] > 0:
+        _find_angles(cosine, sine, nowhere, found, size, k, angles)
+    return k
 
 
 @kernel
-def _count(first, pixel, samples, left_out, counted):  # type: ignore[no-untyped-def]
-    """Count samples of baselines, gaps too."""
-    n_det, n_base = counted.shape
-    for d in range(n_det):
-        for b in range(n_base):
-            counted[d, b] = 0
-            for r in range(first[d * n_base + b], first[d * n_base + b + 1]):
-                if pixel[r] < left_out:
-                    counted[d, b] += samples[r]
+def _find_angles(cosine, sine, nowhere, found, size, k, angles):  # type: ignore[no-untyped-def]
+    """Means of c and s over each of k runs; 0 for gaps."""
+    d, t = 0, 0
+    for r in range(k):
+        c, s = 0.0, 0.0
+        for i in range(t, t + size[r] if found[r] < nowhere else t):
+            c += cosine[d, i]
+            s += sine[d, i]
+        angles[0, r], angles[1, r] = c / size[r], s / size[r]
+        t += size[r]
+        if t == cosine.shape[1]:
+            d, t = d + 1, 0
 
 
 @kernel

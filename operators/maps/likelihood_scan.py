@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 from zonda.core.data import Block, Observation, Stream
 from zonda.core.errors import PipelineError
 from zonda.core.numerics.chunks import TILE_SAMPLES
+from zonda.core.polarization import PolarizationAngles
 from zonda.core.signal import MAIN
 from zonda.core.types import AnyFloats, Floats
 
 from .baseline_noise import BaselineNoise, estimate, filled, members, of_scene, of_table
 from .bin_map import Prepared
 from .binning import Weights, binnings
-from .compressed_scan import RunsOfTiles, Tile, add_baselines, add_groups
+from .compressed_scan import Keeps, RunsOfTiles, Tile, add_baselines, add_groups
+from .grid import Looking
 from .intensity_kernel import VALUE, WEIGHT
 from .normal_equations import Compressed
 from .parameters import LikelihoodParameters
@@ -38,6 +40,64 @@ LOCK = threading.Lock()
 """Held while a thread adds to the sums of a scan."""
 
 
+@dataclass(frozen=True)
+class BandPointing:
+    """Pixels and angles of the good detectors ``rows`` (n,) of a band.
+
+    ``first``: number of its first pixel in the scan; ``flagged`` (n_samp,): instants that do not
+    count; ``angles``: None for maps of I.
+    """
+
+    looking: Looking
+    rows: NDArray[np.intp]
+    first: int
+    flagged: NDArray[np.bool_]
+    angles: PolarizationAngles | None
+
+    def pixels(self, which: NDArray[np.intp], start: int, stop: int) -> NDArray[np.int32]:
+        """(n, stop - start) pixels of detectors, -1 of samples that do not count."""
+        found = self.looking.pixels(which, start, stop)
+        if self.first:
+            found[found >= 0] += self.first
+        found[:, self.flagged[start:stop]] = -1
+        return found
+
+    def seen(self, some: slice) -> tuple[NDArray[np.int32], Floats, Floats]:
+        """Pixels, c and s of some good detectors."""
+        which, observation = self.rows[some], self.looking.observation
+        n = 0 if self.angles is None else observation.n_samples
+        cosine, sine = np.empty((2, which.size, n))
+        if self.angles is not None:
+            efficiency = observation.focalplane.polarization_efficiency[which, None]
+            self.angles.fill(which, 0, cosine, sine)
+            cosine *= efficiency
+            sine *= efficiency
+        return self.pixels(which, 0, observation.n_samples), cosine, sine
+
+
+@dataclass(frozen=True)
+class ScanPointing:
+    """Pixels and angles of the good detectors of all bands; samples ``lost`` (n, 2), detector and
+    instant in order, have no value in the streams.
+    """
+
+    bands: Sequence[tuple[slice, BandPointing]]
+    lost: NDArray[np.intp]
+
+    def __call__(self, some: slice) -> tuple[NDArray[np.int32], Floats, Floats]:
+        """See `RunsOfPointing.find`."""
+        parts = [
+            band.seen(slice(max(some.start - own.start, 0), some.stop - own.start))
+            for own, band in self.bands
+            if own.start < some.stop and some.start < own.stop
+        ]
+        pixel, cosine, sine = (np.concatenate(one) for one in zip(*parts, strict=True))
+        begin, end = np.searchsorted(self.lost[:, 0], [some.start, some.stop])
+        row, t = self.lost[begin:end].T
+        pixel[row - some.start, t] = -1
+        return pixel, cosine, sine
+
+
 @dataclass
 class BandScan:
     """A scan with the detectors of one band: what `prepare` knows, and where they stand in the
@@ -51,8 +111,8 @@ class BandScan:
         Variance that weights are in units of, K^2.
     spare
         Arrays for sums of threads.
-    in_files
-        The compressed scan does not fit in memory.
+    keeps
+        Where runs are kept.
     rows
         (n,) the good detectors.
     of_stream, of_scan
@@ -65,7 +125,7 @@ class BandScan:
     observation: Observation
     reference: float
     spare: Any
-    in_files: bool = False
+    keeps: Keeps = Keeps.MEMORY
     rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     of_stream: slice = field(default_factory=lambda: slice(0))
     of_scan: slice = field(default_factory=lambda: slice(0))
@@ -73,30 +133,15 @@ class BandScan:
     scan: Any = None
 
     @property
-    def looking(self) -> Any:
-        """Pointing of the detectors."""
-        return self.prepared.halves[0][0].looking
-
-    def pixels(
-        self,
-        which: NDArray[np.intp],
-        start: int,
-        stop: int,
-        *signals: AnyFloats,
-    ) -> NDArray[np.int32]:
-        """(n, stop - start) pixels of detectors, -1 of samples that do not count."""
-        found: NDArray[np.int32] = self.looking.pixels(which, start, stop)
-        if self.first:
-            found[found >= 0] += self.first
-        found[:, self.prepared.halves[0][0].samples[start:stop] == 0] = -1
-        for signal in signals:
-            found[~np.isfinite(signal)] = -1
-        return found
+    def pointing(self) -> BandPointing:
+        """Pixels and angles of the good detectors."""
+        made = self.prepared.halves[0][0]
+        return BandPointing(made.looking, self.rows, self.first, made.samples == 0, made.angles)
 
     def tiles(
-        self, detectors: slice, samples: slice, part: AnyFloats, mean: Any, nowhere: int
+        self, detectors: slice, samples: slice, part: AnyFloats, mean: Any
     ) -> Iterator[tuple[NDArray[np.intp], Tile, int, NDArray[np.int64]]]:
-        """Rows in the scan, runs, first sample, and sum over detectors of each group (n_groups, n),
+        """Rows in the scan, sums, first sample, and sum over detectors of each group (n_groups, n),
         of a block of the stream, tile after tile.
         """
         begin = max(detectors.start, self.of_stream.start)
@@ -105,8 +150,7 @@ class BandScan:
         which = self.rows[(place >= begin) & (place < end)]
         if not which.size:
             return
-        angles, observation = self.prepared.halves[0][0].angles, self.observation
-        efficiency = observation.focalplane.polarization_efficiency[which, None]
+        pointing, single = self.pointing, self.observation.hwp_angle is not None
         rows = self.of_scan.start + np.searchsorted(self.rows, which)
         for start in range(samples.start, samples.stop, TILE_SAMPLES):
             stop = min(start + TILE_SAMPLES, samples.stop)
@@ -115,14 +159,11 @@ class BandScan:
             signal = np.asarray(part[at - detectors.start, here], np.float64)
             if mean is not None:
                 signal += mean.evaluate(slice(begin, end), slice(start, stop))[at - begin]
-            cosine, sine = np.zeros((2, which.size, 0 if angles is None else stop - start))
-            if angles is not None:
-                angles.fill(which, start, cosine, sine)
-                cosine *= efficiency
-                sine *= efficiency
-            pixel, single = self.pixels(which, start, stop, signal), observation.hwp_angle
-            each = cosine, sine, single is not None
-            tile = Tile.of(signal, pixel, start, self.scan.length, nowhere, *each)
+            pixel = pointing.pixels(which, start, stop)
+            lost = np.argwhere((pixel >= 0) & ~np.isfinite(signal))
+            pixel[*lost.T] = -1
+            lost = np.stack([rows[lost[:, 0]], start + lost[:, 1]], axis=1)
+            tile = Tile.of(signal, pixel, start, self.scan.length, single, lost)
             total = np.zeros((len(self.scan.total), stop - start), np.int64)
             add_groups(signal, pixel, self.scan.groups[rows], VALUE, total)
             yield rows, tile, start, total
@@ -135,7 +176,7 @@ class BandScan:
         weight[self.rows] = rounded = np.rint(self.reference / white * WEIGHT) / WEIGHT
         made = binnings(
             "scans",
-            self.looking,
+            first.looking,
             Weights(weight, weight.copy(), np.zeros(0)),
             first.samples.astype(bool),
             self.spare,
@@ -157,7 +198,9 @@ class BandScan:
             stop = min(start + TILE_SAMPLES, block.samples.stop)
             here = slice(start - block.samples.start, stop - block.samples.start)
             parts = [signal[rows, here] for signal in signals]
-            pixel = self.pixels(which, start, stop, *parts)
+            pixel = self.pointing.pixels(which, start, stop)
+            for part in parts:
+                pixel[~np.isfinite(part)] = -1
             base = slice(start // scan.length, (stop - 1) // scan.length + 1)
             for name, part in zip(block.signals, parts, strict=True):
                 if name not in scan.baselines:
@@ -219,7 +262,7 @@ class LikelihoodScan:
             band.of_stream = slice(row, row + own.n_detectors)
             band.of_scan, band.first = slice(before, before + band.rows.size), nowhere
             found.append(row + band.rows)
-            row, nowhere = band.of_stream.stop, nowhere + int(band.looking.grid.n_pixels)
+            row, nowhere = band.of_stream.stop, nowhere + int(band.pointing.looking.grid.n_pixels)
         self.rows, mean = np.concatenate(found), stream.means.get(MAIN)
         self.found = RunsOfTiles(self.rows.size, self.observation.n_samples, self.length)
         groups = np.unique(step.groups_of(self.observation)[self.rows], return_inverse=True)
@@ -227,14 +270,23 @@ class LikelihoodScan:
         self.total = np.zeros((len(groups[0]), self.observation.n_samples), np.int64)
 
         def tiles(detectors: slice, samples: slice, part: AnyFloats) -> list[Any]:
-            block = detectors, samples, part, mean, nowhere
+            block = detectors, samples, part, mean
             return [tile for band in self.bands for tile in band.tiles(*block)]
 
         for _, _, made in stream.sweep(tiles):
             for rows, tile, start, total in made:
                 self.found.add(rows, tile)
                 self.total[:, start : start + total.shape[1]] += total
-        self.scan = self.found.scan(self.observation.sample_rate, nowhere)
+        pointing = [(band.of_scan, band.pointing) for band in self.bands]
+        self.scan = self.found.scan(
+            self.observation.sample_rate,
+            nowhere,
+            ScanPointing(pointing, self.found.lost),
+            polarized=pointing[0][1].angles is not None,
+            single=self.observation.hwp_angle is not None,
+            keeps=max(band.keeps for band in self.bands),
+            threads=stream.threads,
+        )
 
     def steady(self, white: Floats) -> Floats:
         """(n, n_base) means of baselines, K. Where samples of some detectors lack, without what the

@@ -27,6 +27,7 @@ from zonda.core.plan.planning import planning_of
 
 from .bin_map import BinMap
 from .binning import Weights
+from .compressed_scan import Keeps
 from .likelihood_maps import LikelihoodMaps, LikelihoodSystem
 from .likelihood_scan import BandScan, LikelihoodScan
 from .map_layout import MapLayout
@@ -60,6 +61,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
 
     _samples: tuple[int, int] = PrivateAttr((0, 0))
     _at_once: int = PrivateAttr(1)
+    _keeps: Keeps = PrivateAttr(Keeps.MEMORY)
     _in_files: bool = PrivateAttr(False)
     _bands: int = PrivateAttr(1)
 
@@ -78,8 +80,11 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         if data.files is not None and every:
             planning: Any = planning_of(self)
             longest = max(data.observations, key=lambda o: o.n_detectors * o.n_samples)
+            if not data.files.hold(planning.compressed(longest)):
+                self._keeps = Keeps.AGAIN
             size, place = planning.compressed(longest), f"{self.label}, compressed scans"
             self._in_files = data.files.needed(size, place, planning.smaller)
+            self._keeps = max(self._keeps, Keeps(self._in_files))
 
     def check(self, data: Data) -> list[str]:
         """See `BinMap.check`. Raises PipelineError for too few or too short baselines."""
@@ -139,7 +144,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
                 cure="leave the window out: slow noise needs none here",
             )
         prepared = super().prepare(observation)
-        more = self._layout["variance"], self._spare, self._in_files
+        more = self._layout["variance"], self._spare, self._keeps
         return BandScan(prepared, observation, *more)
 
     def measure(self, stream: Stream, model: Any = None) -> BandScan | LikelihoodScan:
@@ -200,9 +205,11 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         scan: LikelihoodScan = state.scan
         if state is scan.bands[0]:
             scans = CompressedScans([scan.compressed()])
-            if any(band.in_files for band in scan.bands):
+            if self._in_files:
                 scans = CompressedScans.of(data.files.put(scans.arrays()))
-                observation.log.state(self.label, "compressed scans", "in temporary files")
+                scans.scans[0].scan.again = scan.scan.again
+            if where := self._where:
+                observation.log.state(self.label, "compressed scans", where)
             data.add(f"{self.label} scans", scans)
         log, noise = observation.log, scan.noise
         seconds = scan.length / observation.sample_rate
@@ -213,6 +220,14 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
             log.state(self.label, "samples of the last baseline, which is shorter", str(lost))
         powers = ", ".join(f"{value:.3g}" for value in noise.values)
         log.state(self.label, "power of modes over white noise", powers or "no modes")
+
+    @property
+    def _where(self) -> str:
+        """Where compressed scans are, in words; empty for memory."""
+        files = "in temporary files" if self._in_files else ""
+        if self._keeps is not Keeps.AGAIN:
+            return files
+        return f"runs are found anew in each iteration, baselines {files or 'in memory'}"
 
     def finalize(self, data: Data) -> None:
         """Solve for the map of each signal."""

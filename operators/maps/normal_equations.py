@@ -79,7 +79,7 @@ class CompressedScans(Product):
         return {
             "scans": [
                 {
-                    "scan": vars(c.scan),
+                    "scan": {key: v for key, v in vars(c.scan).items() if key != "again"},
                     "noise": vars(c.noise),
                     "data": {n: list(d) for n, d in c.data.items()},
                     "ends": c.ends,

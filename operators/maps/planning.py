@@ -13,7 +13,7 @@ from zonda.core.plan.bounds import Traits
 from zonda.core.plan.planning import Planning, samples_in
 
 from .bin_map import BinMap
-from .compressed_scan import PART
+from .compressed_scan import FOUND, PART, Keeps
 from .coverage import COUNTS
 from .grid import in_frame
 from .map_layout import MapLayout
@@ -104,13 +104,11 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
     smaller = "choose a larger pixel or a longer baseline, or shorter scans"
 
     def memory(self, observation: Observation) -> int:
-        """The compressed scans; twice the runs of a scan while these are put in order, sums and
-        spectra of its baselines; and its compiled code.
+        """The compressed scans, unless they are in files; runs of some detectors; sums and spectra
+        of the baselines of a scan; and its compiled code.
         """
         signals = len(observation.signals)
-        samples = observation.n_samples * observation.n_detectors
-        own = self.of_run * samples * self.runs(observation)
-        own += (60 + 8 * signals) * self.baselines(observation)
+        own = 8 * FOUND + (60 + 8 * signals) * self.baselines(observation)
         own += 16 * signals * self.free(observation) * observation.n_samples
         if not self.operator._in_files:
             own += self.compressed(observation)
@@ -119,13 +117,18 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
     def compressed(self, observation: Observation) -> int:
         """Bytes of all compressed scans: 6 r N + (12 + 8 n) N / L + 8 n k T for n signals and k
         free modes of N samples at T instants, r runs a sample, and 6 a gap; 22 r N with I, Q and U.
+        Of runs that are found anew (4 + 8 n) N / L + 8 n k T. With gaps 4 N / L more.
         """
         step, signals = self.operator, len(observation.signals)
         samples, instants = step._samples
         baselines = samples / self.length(observation)
         free = 8 * signals * self.free(observation) * instants
-        runs = samples * self.runs(observation) + self.gaps(observation)
-        return int(self.of_run * runs + (12 + 8 * signals) * baselines + free)
+        gaps = self.gaps(observation)
+        each = 8 * signals + (8 if gaps else 4)
+        if step._keeps is Keeps.AGAIN:
+            return int(each * baselines + free)
+        runs = samples * self.runs(observation) + gaps
+        return int(self.of_run * runs + (8 + each) * baselines + free)
 
     def free(self, observation: Observation) -> int:
         """Free modes of all groups."""
@@ -199,11 +202,14 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """Readings, the size of the compressed scans, and solutions."""
         step, longest = self.operator, max(observations, key=lambda o: o.n_samples * o.n_detectors)
         size, runs = self.compressed(longest), self.runs(longest)
+        kept = f"at {runs:.2g} runs a sample ({self.of_run} bytes each)"
+        if step._keeps is Keeps.AGAIN:
+            kept = f"without runs ({runs:.2g} a sample): these are found anew in each iteration"
         where = "in temporary files" if step._in_files else "in memory"
         return [
             "each scan is read twice: for runs, baselines and noise; for sums and free modes",
-            f"compressed scans take {size / 1e9:.3g} GB {where}, at {runs:.2g} runs a sample"
-            f" ({self.of_run} bytes each) and baselines of {step.baseline_of(longest):.3g} s",
+            f"compressed scans take {size / 1e9:.3g} GB {where}, with baselines of"
+            f" {step.baseline_of(longest):.3g} s, {kept}",
             f"{self._solutions(longest)} solutions by conjugate gradients, {step.refined} of them"
             " for the noise",
         ]

@@ -17,12 +17,15 @@ from zonda.core.campaign import tasks
 from zonda.core.campaign.campaign_file import Job
 from zonda.core.configuration.pipeline_file import load
 from zonda.core.errors import PipelineError
+from zonda.core.flags import OPAQUE
 from zonda.core.hooks import manager
 from zonda.core.run import streams
 from zonda.core.run.streams import Files
 from zonda.operators.maps import compressed_scan
+from zonda.plugins.checks.scenes import run as run_of
 
 from ...scenes import camera
+from .test_maximum_likelihood import SIGMA, drifts, observation
 
 YAML = f"""\
 {camera(76)}campaign: CAMPAIGN
@@ -87,19 +90,73 @@ def test_streams_that_do_not_fit_are_made_again_for_both_readings(ample, tmp_pat
     assert again == [f"stream {name} made again when it is read" for name in STREAMS]
 
 
-def test_compressed_scans_in_files_have_the_same_bits(ample, tmp_path, monkeypatch):
+AGAIN = "runs are found anew in each iteration, baselines "
+
+
+@pytest.mark.parametrize(
+    ("hold", "room", "said"),
+    [
+        (True, 0, "in temporary files"),
+        (False, 0, f"{AGAIN}in temporary files"),
+        (False, 1 << 40, f"{AGAIN}in memory"),
+    ],
+)
+def test_compressed_scans_have_the_same_bits_wherever_they_are(
+    ample, tmp_path, monkeypatch, hold, room, said
+):
     """Some detectors at a time; two threads."""
-    monkeypatch.setattr("zonda.core.pipeline.files_of", lambda budget: Files(0))
+    monkeypatch.setattr("zonda.core.pipeline.files_of", lambda budget: Files(room))
+    monkeypatch.setattr(Files, "hold", lambda self, size: hold)
     monkeypatch.setattr(streams, "LEAST_FILE", 1)
     monkeypatch.setattr(compressed_scan, "PART", 5000)
+    monkeypatch.setattr(compressed_scan, "FOUND", 100_000)
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     data = run(tmp_path, threads=2)
     assert digest(data) == ample[0]
-    assert ("MaximumLikelihoodMap", "compressed scans", "in temporary files") in list(data.log)
+    assert ("MaximumLikelihoodMap", "compressed scans", said) in list(data.log)
     assert not any(what == "compressed scans" for _, what, _ in ample[1].log)
     assert not list(temporary.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("polarized", "plate", "how"),
+    [
+        (False, False, {"pixel": "15 arcsec", "width": "7.5 arcmin"}),
+        (False, False, {"nside": 8192}),
+        (True, False, {"pixel": "15 arcsec", "stokes": "IQU"}),
+        (True, True, {"pixel": "15 arcsec", "stokes": "IQU"}),
+    ],
+)
+def test_gaps_and_angles_have_the_same_bits_wherever_they_are(monkeypatch, polarized, plate, how):
+    """Samples without a value, in stretches and alone, flagged instants, a detector without any."""
+    rng = np.random.default_rng(3)
+    maker = zonda.MaximumLikelihoodMap(half_difference=False, tolerance=0.09, refine=0, **how)
+    o = observation(polarized, plate)
+    noise = drifts(o, rng) + SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
+    noise[rng.random(noise.shape) < 0.002] = np.nan
+    noise[5:9, 2000:2300] = noise[3] = np.nan
+    monkeypatch.setattr(streams, "LEAST_FILE", 1)
+    monkeypatch.setattr(compressed_scan, "PART", 50_000)
+
+    def made(hold, room, found):
+        o = observation(polarized, plate)
+        o.flags[1000:1100] |= OPAQUE
+        with monkeypatch.context() as here:
+            here.setattr("zonda.core.pipeline.files_of", lambda budget: Files(room))
+            here.setattr(Files, "hold", lambda self, size: hold)
+            here.setattr(compressed_scan, "FOUND", found)
+            data = run_of([maker], o, noise)
+        said = [text for _, what, text in data.log if what == "compressed scans"]
+        planes = data["map"].planes.values()
+        return [np.asarray(plane.values).tobytes() for plane in planes], said
+
+    whole, said = made(True, 1 << 40, 1 << 22)
+    assert not said
+    assert made(True, 0, 1) == (whole, ["in temporary files"])
+    assert made(False, 0, 1) == (whole, [f"{AGAIN}in temporary files"])
+    assert made(False, 1 << 40, 1 << 19) == (whole, [f"{AGAIN}in memory"])
 
 
 def test_scans_that_fit_nowhere_are_refused_before_anything_runs(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from zonda.operators.maps import compressed_scan
 from zonda.operators.maps.baseline_noise import (
     BaselineNoise,
     estimate,
@@ -13,7 +14,7 @@ from zonda.operators.maps.baseline_noise import (
     leading_of,
     polynomials,
 )
-from zonda.operators.maps.compressed_scan import RunsOfTiles, Tile, add_baselines
+from zonda.operators.maps.compressed_scan import Keeps, RunsOfTiles, Tile, add_baselines
 from zonda.operators.maps.normal_equations import NormalEquations, WeighedScan
 
 N_DET, N, LENGTH, N_PIX, RATE = 5, 144, 6, 40, 6.0
@@ -30,18 +31,22 @@ def pointing(rng, flagged, n=N):
     return pixel
 
 
-def compressed(signal, pixel, angles=None, cuts=(50, 96), single=False):
-    """The scan, found in tiles that end at ``cuts``."""
+def compressed(signal, pixel, angles=None, cuts=(48, 96), single=False, **how):
+    """The scan, found in tiles that end at ``cuts``, where baselines end."""
     c, s = np.zeros((2, N_DET, 0)) if angles is None else angles
     found = RunsOfTiles(N_DET, pixel.shape[1], LENGTH)
     edges = [0, *cuts, pixel.shape[1]]
     for a, b in pairwise(edges):
         part = slice(a, b)
-        tile = Tile.of(
-            signal[:, part], pixel[:, part], a, LENGTH, N_PIX, c[:, part], s[:, part], single
-        )
+        none = np.zeros((0, 2), int)
+        tile = Tile.of(signal[:, part], pixel[:, part], a, LENGTH, single, none)
         found.add(np.arange(N_DET), tile)
-    return found, found.scan(RATE, N_PIX)
+
+    def find(some):
+        return pixel[some], c[some], s[some]
+
+    how = {"polarized": angles is not None, "single": single, **how}
+    return found, found.scan(RATE, N_PIX, find, **how)
 
 
 def matrix(pixel, angles=None):
@@ -191,6 +196,26 @@ def test_the_map_is_that_of_generalized_least_squares(flagged, polarized, free):
     np.testing.assert_allclose(difference, 0, atol=1e-8 * np.abs(best).max())
 
 
+@pytest.mark.parametrize("free", [0, 1, 2])
+@pytest.mark.parametrize("single", [False, True])
+def test_runs_that_are_found_anew_change_no_bit(monkeypatch, single, free):
+    """A detector at a time; gaps, flagged instants, a detector without samples."""
+    rng = np.random.default_rng(8)
+    pixel = pointing(rng, True)
+    pixel[:, 40:45], pixel[4] = -1, -1
+    angles = np.cos(pixel), np.sin(pixel)
+    signal, noise = rng.normal(size=pixel.shape), noise_of(np.ones(N_DET), free)
+    m = rng.normal(size=(3, N_PIX))
+    monkeypatch.setattr(compressed_scan, "FOUND", 1)
+    found = []
+    for keeps in Keeps:
+        _, scan = compressed(signal, pixel, angles, single=single, keeps=keeps)
+        assert (scan.again is None) == (keeps is not Keeps.AGAIN)
+        found.append(NormalEquations([WeighedScan(scan, noise)], 3, N_PIX).apply(m))
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
 @pytest.mark.parametrize("flagged", [False, True])
 def test_a_noiseless_sky_comes_back(flagged):
     """Exactly, whatever the noise model, but for the mean."""
@@ -229,10 +254,7 @@ def test_memory_does_not_grow_with_scans():
 def test_tiles_change_no_bit():
     rng = np.random.default_rng(6)
     pixel, signal = pointing(rng, True), rng.normal(size=(N_DET, N))
-    (one, whole), (two, parts) = (
-        compressed(signal, pixel, cuts=cuts)
-        for cuts in ((), (48, 96))  # tiles end where baselines end
-    )
+    (one, whole), (two, parts) = (compressed(signal, pixel, cuts=cuts) for cuts in ((), (48, 96)))
     assert (one.sums == two.sums).all()
     for name in ("pixel", "samples", "first", "counted"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))

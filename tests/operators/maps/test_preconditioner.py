@@ -26,10 +26,13 @@ def scan(tilt, noise):
     pixel = (np.rint(y) * SIDE + np.rint(x)).astype(np.int32)
     nothing = np.zeros((N_DET, 0))
     found = RunsOfTiles(N_DET, N, LENGTH)
-    signal = np.zeros(pixel.shape)
-    tile = Tile.of(signal, pixel, 0, LENGTH, GRID.n_pixels, nothing, nothing, False)
+    tile = Tile.of(np.zeros(pixel.shape), pixel, 0, LENGTH, False, np.zeros((0, 2), int))
     found.add(np.arange(N_DET), tile)
-    return WeighedScan(found.scan(RATE, GRID.n_pixels), noise)
+
+    def find(some):
+        return pixel[some], nothing[some], nothing[some]
+
+    return WeighedScan(found.scan(RATE, GRID.n_pixels, find), noise)
 
 
 def survey(places=GRID.places):
