@@ -161,7 +161,8 @@ def for_run(
 def _measured(file: PipelineFile, contexts: Sequence[Context]) -> Timing | None:
     """CPU time of a planned pipeline; None, with a warning, if a slice of it cannot be run."""
     try:
-        return timed(file, [o for context in contexts for o in context.observations])
+        every = [o for context in contexts for o in context.observations]
+        return timed(file, every, contexts[0].operators)
     except ZondaError as err:
         text = f"no time is predicted, since a slice of the pipeline does not run: {err.message}"
         warnings.warn(text, stacklevel=3)

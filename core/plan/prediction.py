@@ -105,7 +105,9 @@ class Timing:
         return self.setup.get(label, 0.0) + self.growing.get(label, 0.0)
 
 
-def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
+def timed(
+    file: PipelineFile, observations: Sequence[Observation], observed: Sequence[Operator] = ()
+) -> Timing:
     """Time of a pipeline from two slices of its first scan, one `SHORTER` times as long as the
     other; each is run `TIMES` times, of which the least time of a step counts.
 
@@ -113,7 +115,7 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
     r for each of N detectors x samples; `Planning.finishing` says where finishing grows with N.
     Work that a short slice does not tell (`Planning.counted`) is counted over the whole first scan,
     with few detectors.
-    ``observations``: of the whole pipeline, every band's.
+    ``observations``: of the whole pipeline, every band's; ``observed``: operators that know them.
 
     Raises
     ------
@@ -122,7 +124,8 @@ def timed(file: PipelineFile, observations: Sequence[Observation]) -> Timing:
     """
     first, bands = observations[0], {o.instrument.band.name for o in observations}
     rate = first.n_detectors * len(bands) * first.sample_rate
-    steps = {o.label: planning_of(o) for o in file.pipeline().operators}
+    know = {o.label: o for o in observed}
+    steps = {o.label: planning_of(know.get(o.label, o)) for o in file.pipeline().operators}
     least = max(planning.shortest for planning in steps.values())
     seconds = min(max(SAMPLES / rate, LEAST_SECONDS, SHORTER * least), SECONDS, first.duration)
     every = max(1, math.ceil(seconds * rate / SAMPLES))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -244,7 +245,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
 
     @property
     def brief(self) -> MaximumLikelihoodMap:
-        """Few iterations, without patterns."""
+        """Few iterations, without patterns; runs are found anew where those of the run are."""
         few = {"tolerance": max(self.operator.tolerance, BRIEF), "patterns": 0}
         return self.operator.model_copy(update=few)
 
@@ -254,13 +255,15 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         layout = MapLayout(step)
         pixels = layout.grid(layout.place(observations, {})).n_pixels
         larger = max(1, math.ceil(math.sqrt(pixels / MOST_COUNTED)))
-        if step.nside:
-            nside = max(step.nside >> (larger - 1).bit_length(), 1)
-            return step.model_copy(update={"nside": nside})
         pixel = step.pixel * larger
         if step.projection == "CAR":
             pixel = math.pi / max(round(math.pi / pixel), 1)
-        return step.model_copy(update={"pixel": pixel})
+        grid: dict[str, Any] = {"pixel": pixel}
+        if step.nside:
+            grid = {"nside": max(step.nside >> (larger - 1).bit_length(), 1)}
+        made = step.model_copy(update=grid)
+        made._keeps = Keeps.MEMORY
+        return made
 
     def _solutions(self, observation: Observation) -> int:
         """Solutions over all samples; two halves are one."""

@@ -130,13 +130,12 @@ def test_compressed_scans_have_the_same_bits_wherever_they_are(
     ],
 )
 def test_gaps_and_angles_have_the_same_bits_wherever_they_are(monkeypatch, polarized, plate, how):
-    """Samples without a value, in stretches and alone, flagged instants, a detector without any."""
+    """Samples without a value, in stretches and alone, and flagged instants."""
     rng = np.random.default_rng(3)
     maker = zonda.MaximumLikelihoodMap(half_difference=False, tolerance=0.09, refine=0, **how)
     o = observation(polarized, plate)
     noise = drifts(o, rng) + SIGMA * rng.normal(size=(o.n_detectors, o.n_samples))
-    noise[rng.random(noise.shape) < 0.002] = np.nan
-    noise[5:9, 2000:2300] = noise[3] = np.nan
+    noise[2, ::97] = noise[5:9, 2000:2300] = np.nan
     monkeypatch.setattr(streams, "LEAST_FILE", 1)
     monkeypatch.setattr(compressed_scan, "PART", 50_000)
 
