@@ -40,8 +40,10 @@ beyond, a scan is refused.
 
 _DEGREES = (4, 6, 8, 11, 15, 20, 28, 40)
 
-_WIDER = 0.05
-"""Share by which the ranges of the polynomials reach beyond what the rim of the field spans."""
+_WIDER, _NARROWEST = 0.05, 1e-5
+"""Share by which the ranges of the polynomials reach beyond what the rim of the field spans; least
+sine of the elevation: axes beyond the ends of a scan are unit vectors but for 1e-6.
+"""
 
 
 class LinesOfSight:
@@ -145,7 +147,7 @@ class LinesOfSight:
             math.asin(min(float(up[:, 0].max()), 1.0)) + radius > math.pi / 2
         ):  # the zenith may lie inside the field
             high = 1.0
-        wider = _WIDER * (high - low)
+        wider = max(_WIDER * (high - low), _NARROWEST)
         return max(low - wider, low / 2), min(high + wider, 1.0)
 
     def _polynomials(self, cone: Cone, rows: Floats, xi: Floats, eta: Floats) -> tuple[Floats, ...]:
