@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from zonda.core.data import Data, Observation
-from zonda.core.numerics.projection import boresights
 from zonda.core.plan.bounds import Traits
 from zonda.core.plan.planning import Planning, samples_in
 
@@ -29,6 +29,8 @@ BRIEF = 1e-2
 """Residual at which iterations end whose time is measured."""
 MOST_COUNTED = 500_000
 """Pixels of a map whose iterations are counted, about."""
+WINDOWS, WINDOW = 64, 64
+"""Windows of a scan, and their samples, in which changes of pixel are counted."""
 COMPILED = 25_000_000
 """Bytes of the compiled code of maximum-likelihood maps, and of what the allocator keeps."""
 
@@ -184,14 +186,20 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         return self.operator.stokes == "IQU"
 
     def runs(self, observation: Observation) -> float:
-        """Runs per sample: the boresight crosses 4 / pi pixels for each pixel of its way, and runs
-        end with baselines.
+        """Runs per sample: changes of pixel of some detectors in windows of the scan, a tenth more,
+        and ends of baselines.
         """
         if observation.hwp_angle is not None:
             return 1.0
-        forward = np.diff(boresights(observation.boresight_radec), axis=1)
-        way = float(np.sqrt((forward**2).sum(axis=0)).mean()) if forward.size else 0.0
-        crossed = 4 / math.pi * way / (self.traits(observation).pixel or way or 1.0)
+        n, grid, plane = observation.n_samples, self.operator.grid, observation.focalplane
+        starts = np.linspace(0, max(n - WINDOW, 0), WINDOWS).astype(np.intp)
+        some = (starts[:, None] + np.arange(min(WINDOW, n))).ravel()
+        h = grid.pointing(replace(observation, boresight_radec=observation.boresight_radec[some]))
+        every = slice(None, None, -(-len(plane) // 37))
+        index = np.empty((len(plane.xi[every]), some.size), np.int32)
+        grid.pixels(h, 0, some.size, plane.xi[every], plane.eta[every], index)
+        changes = np.diff(index.reshape(len(index), WINDOWS, -1), axis=2) != 0
+        crossed = float(changes.mean()) if changes.size else 0.0
         return min(1.0, 1.1 * crossed + 1 / self.length(observation))
 
     @property

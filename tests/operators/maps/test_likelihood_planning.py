@@ -1,5 +1,6 @@
 """Plans of maximum-likelihood maps: what they hold, and how long they take."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 import zonda
 from zonda.core.configuration.pipeline_file import parse
 from zonda.core.data import Data
+from zonda.core.numerics.quaternions import from_angles
 from zonda.core.plan.planner import plan
 from zonda.core.plan.planning import planning_of
 from zonda.operators.maps import planning
+from zonda.operators.maps.grid import Looking
 from zonda.operators.maps.maximum_likelihood import MaximumLikelihoodMap
 from zonda.operators.maps.noise_record import NoiseRecord
 from zonda.operators.maps.normal_equations import NormalEquations, Work
@@ -57,6 +60,23 @@ def test_compressed_scans_are_as_large_as_planned(stokes, baseline):
     # are planned, and some runs end where baselines do
     assert held < planned < 1.4 * held
     assert f"{planned / 1e9:.3g} GB" in " ".join(planning_of(maker).states([o]))
+
+
+@pytest.mark.parametrize("projection", ["TAN", "CAR"])
+def test_runs_are_counted_on_the_grid(projection):
+    """At 75 deg of declination CAR pixels are four times as high as wide, and runs 1.4 times as many
+    as those of square pixels of the same area.
+    """
+    o, turn = scan(37, 6000), 2 * np.pi * np.arange(6000) / 2000
+    reach, (ra, dec) = np.radians(0.05), np.radians([75.0, 75.0])
+    along = ra + reach * np.cos(turn) / np.cos(dec), dec + reach * np.sin(turn)
+    o = replace(o, boresight_radec=from_angles(*along), centre=(float(ra), float(dec)))
+    step = MaximumLikelihoodMap(pixel="10 arcsec", projection=projection, baseline="2 s")
+    step.observe(Data(scene(o.instrument), [o]))
+    pixel = Looking.of(o, step.grid).pixels(np.arange(37), 0, o.n_samples)
+    changes = (np.diff(pixel, axis=1) != 0).mean()
+    # a tenth more is planned, and 1 / 200 for ends of baselines
+    assert changes < planning_of(step).runs(o) < 1.2 * changes + 1 / 200
 
 
 @pytest.mark.parametrize(
