@@ -14,7 +14,7 @@ from zonda.core.plan.bounds import Traits
 from zonda.core.plan.planning import Planning, samples_in
 
 from .bin_map import BinMap
-from .compressed_scan import FOUND, PART, Keeps
+from .compressed_scan import PART, Keeps
 from .coverage import COUNTS
 from .grid import in_frame
 from .map_layout import MapLayout
@@ -22,6 +22,7 @@ from .maximum_likelihood import FEWEST, MaximumLikelihoodMap
 from .noise_record import NoiseRecord
 from .normal_equations import Work
 from .parameters import LONGEST
+from .runs_of_pointing import FOUND
 
 HEALPY = 32_000_000
 """Bytes of the library."""

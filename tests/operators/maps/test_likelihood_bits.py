@@ -21,7 +21,7 @@ from zonda.core.flags import OPAQUE
 from zonda.core.hooks import manager
 from zonda.core.run import streams
 from zonda.core.run.streams import Files
-from zonda.operators.maps import compressed_scan
+from zonda.operators.maps import compressed_scan, runs_of_pointing
 from zonda.plugins.checks.scenes import run as run_of
 
 from ...scenes import camera
@@ -109,7 +109,7 @@ def test_compressed_scans_have_the_same_bits_wherever_they_are(
     monkeypatch.setattr(Files, "hold", lambda self, size: hold)
     monkeypatch.setattr(streams, "LEAST_FILE", 1)
     monkeypatch.setattr(compressed_scan, "PART", 5000)
-    monkeypatch.setattr(compressed_scan, "FOUND", 100_000)
+    monkeypatch.setattr(runs_of_pointing, "FOUND", 100_000)
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
@@ -145,7 +145,7 @@ def test_gaps_and_angles_have_the_same_bits_wherever_they_are(monkeypatch, polar
         with monkeypatch.context() as here:
             here.setattr("zonda.core.pipeline.files_of", lambda budget: Files(room))
             here.setattr(Files, "hold", lambda self, size: hold)
-            here.setattr(compressed_scan, "FOUND", found)
+            here.setattr(runs_of_pointing, "FOUND", found)
             data = run_of([maker], o, noise)
         said = [text for _, what, text in data.log if what == "compressed scans"]
         planes = data["map"].planes.values()

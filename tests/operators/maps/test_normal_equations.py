@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from zonda.operators.maps import compressed_scan
+from zonda.operators.maps import runs_of_pointing
 from zonda.operators.maps.baseline_noise import (
     BaselineNoise,
     estimate,
@@ -206,7 +206,7 @@ def test_runs_that_are_found_anew_change_no_bit(monkeypatch, single, free):
     angles = np.cos(pixel), np.sin(pixel)
     signal, noise = rng.normal(size=pixel.shape), noise_of(np.ones(N_DET), free)
     m = rng.normal(size=(3, N_PIX))
-    monkeypatch.setattr(compressed_scan, "FOUND", 1)
+    monkeypatch.setattr(runs_of_pointing, "FOUND", 1)
     found = []
     for keeps in Keeps:
         _, scan = compressed(signal, pixel, angles, single=single, keeps=keeps)
