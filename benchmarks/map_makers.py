@@ -30,14 +30,11 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np  # noqa: E402
-from pydantic import PrivateAttr  # noqa: E402
-from scipy import ndimage  # noqa: E402
+from scipy import fft, ndimage  # noqa: E402
 
 import zonda  # noqa: E402
-from zonda.core.data import Data  # noqa: E402
-from zonda.core.maps.noise_figures import matched  # noqa: E402
+import zonda.linear as linear  # noqa: E402
 from zonda.core.numerics.projection import directions  # noqa: E402
-from zonda.operators.maps.grid import Looking  # noqa: E402
 
 RESPONSE = "AtmosphereLayers.layer_response=layer"
 PIPELINES = {
@@ -219,84 +216,75 @@ def compare(kind: str, seed: int, again: Sequence[int], baseline: str | None) ->
 
 
 PLACES = ((0, 0), (30, 30), (-30, 30), (30, -30))
-"""Of the cluster in rows and columns: each is a draw of the noise."""
-SMALL = 1e-3
-"""Of templates in the streams: they change neither modes nor the noise model."""
+"""Of the cluster in rows and columns."""
 
 
-class Template(zonda.Operator):
-    """A map at one of the `PLACES` as a component."""
-
-    requires = frozenset({"boresight"})
-
-    place: int = 0
-    """Its number."""
-    _map: Any = PrivateAttr(None)
-    _maker: Any = PrivateAttr(None)
-
-    @property
-    def provides(self) -> frozenset[str]:
-        return frozenset({zonda.Component(f"t{self.place}", "calibrated")})
-
-    def observe(self, data: Any) -> None:
-        self._maker.observe(Data(data.scene, data.observations))
-
-    def exec(self, block: Any, state: Any) -> None:
-        looking = Looking.of(block.observation, self._maker.grid)
-        rows = np.arange(block.detectors.start, block.detectors.stop)
-        pixel = looking.pixels(rows, block.samples.start, block.samples.stop)
-        block.new(f"t{self.place}")[...] = np.where(pixel < 0, 0.0, self._map[pixel])
+def variance(w: Any, scan: Any, white: float) -> float:
+    """Variance of the sum of a scan's white and pink noise times ``w`` (n_det n_samp,), whose white
+    noise has the variance ``white`` a sample, K^2: exact.
+    """
+    rows = w.reshape(scan.n_detectors, -1)
+    n = 2 * fft.next_fast_len(rows.shape[1])
+    f = np.fft.rfftfreq(n, 1 / scan.sample_rate)
+    step = f[1]
+    f[0] = step / 2
+    own = sum((np.abs(fft.rfft(part, n)) ** 2).sum(axis=0) for part in np.array_split(rows, 16))
+    even = np.abs(fft.rfft(rows.sum(axis=0), n)) ** 2
+    pink = sum(
+        form(f) * ((1 - form.shared) * own + form.shared * even)
+        for form in scan.closed_forms["pink"]
+    )
+    return float(white * (w @ w) + step * np.sum(pink))
 
 
 def templates(seeds: list[int]) -> None:
-    """Signal-to-noise ratio of the true cluster over draws of the noise, at four places for each
-    seed, and deviates of the noise in its units.
+    """Signal-to-noise ratio of the true cluster t, at four places for each seed.
 
-    Maximum likelihood: sqrt(t^T A t), and t^T A n / sqrt(t^T A t) of the map n of the noise. Filter
-    and bin, of which no A is known: a = t^T h m / t^T h f of a map m, with the hits h and the
-    filtered template f, whose scatter over the draws of m = n is the error.
+    Both map makers measure its amplitude as a = w^T d / w^T P t, with w = Q P t of maximum
+    likelihood, and w = F^T P t of filters F, of which the map of hits h has t^T h m = w^T d. The
+    variance of w^T n is exact for white and pink noise; that of the atmosphere is its mean over the
+    draws. Maximum likelihood states w^T P t.
     """
     scene, steps, how, filters = pipeline("m2", 1)
     quiet = [s for s in steps if not {"white", "pink", "atmosphere"} & set(s.provides)]
     truth = run(scene, [*quiet, zonda.BinMap(**how)], signals={})["map"]
     t = np.nan_to_num(truth.signal)
-    sources = []
-    for k, place in enumerate(PLACES):
-        sources.append(Template(place=k, name=f"template{k}"))
-        sources[-1]._map = SMALL * np.roll(t, place, (0, 1)).ravel()
-        sources[-1]._maker = zonda.BinMap(**how)
-    names = [f"t{k}" for k in range(len(PLACES))]
-    signals = {name: {"only": [name]} for name in names} | {"rest": {"without": ["sky", *names]}}
-    rows = []
-    for seed in seeds:
-        scene = scene.model_copy(update={"seed": seed})
-        made = run(
-            scene,
-            [
-                *steps[:-1],
-                *sources,
-                steps[-1],
-                zonda.MaximumLikelihoodMap(**how, product="likely"),
-                *filters,
-                zonda.BinMap(**how, product="binned"),
-            ],
-            full=True,
-            signals=signals,
+    signals = {name: {"only": [name]} for name in ("atmosphere", "white")}
+    kept = ["signal", *(f"signal/{name}" for name in signals)]
+    found = np.zeros((len(seeds), 2, len(PLACES), 3))
+    for sums, seed in zip(found, seeds, strict=True):
+        data = zonda.Pipeline(steps, runs=signals).run(
+            scene.model_copy(update={"seed": seed}), threads=1, keep=kept
         )
-        noise = made["rest/binned"].signal
-        for name, source in zip(names, sources, strict=True):
-            z, size = matched(made[f"{name}/likely"], made["rest/likely"])
-            w = truth.hits * source._map.reshape(noise.shape) / SMALL
-            filtered = float(np.nansum(w * made[f"{name}/binned"].signal)) / SMALL
-            rows.append((1 / size / SMALL, z / size, filtered, float(np.nansum(w * noise))))
-        print(seed, *(" ".join(f"{x:.4g}" for x in row) for row in rows[-len(PLACES) :]), sep="; ")
-    found, n = np.array(rows), len(rows)
-    rms, error = np.sqrt((found**2).mean(axis=0)), 1 / np.sqrt(2 * n)
-    likely, binned = found[:, 0].mean(), found[:, 2].mean() / rms[3]
+        grid = linear.grid(data, zonda.BinMap(**how))
+        scans, noises, _ = linear.compressed(data, zonda.MaximumLikelihoodMap(**how))
+        for scan, compressed, noise in zip(data.observations, scans, noises, strict=True):
+            signal, air, white = (np.asarray(scan.detdata[name], float) for name in kept)
+            F = linear.filters(filters, scan, linear.modes(filters, scan, signal))
+            P, Q = linear.pointing(scan, grid), linear.noise_weight(compressed, noise, scan)
+            for k, place in enumerate(PLACES):
+                seen = P @ np.roll(t, place, (0, 1)).ravel()
+                for row, w in zip(sums[:, k], (F.T @ seen, Q @ seen), strict=True):
+                    row += w @ seen, variance(w, scan, white.var()), w @ air.ravel()
+        print(seed, *(f"{x:.4g}" for x in sums.ravel()))
+    ratio = []
+    for name, (size, quiet_power, air) in zip(
+        ("filter and bin", "maximum likelihood"), np.moveaxis(found, (1, 3), (0, 1)), strict=True
+    ):
+        share = (air**2 / quiet_power).mean(axis=1)
+        error = share.std(ddof=1) / np.sqrt(len(seeds)) if len(seeds) > 1 else np.nan
+        best = float((size / np.sqrt(quiet_power)).mean())
+        ratio.append(best / np.sqrt(1 + share.mean()))
+        half = error / (1 + share.mean()) / 2
+        print(
+            f"{name}: S/N {best:.2f} without the atmosphere, whose power is {share.mean():.3f} +-"
+            f" {error:.3f} of the other noise: {ratio[-1]:.2f} +- {ratio[-1] * half:.2f}"
+        )
+    size, quiet_power, air = np.moveaxis(found[:, 1], 2, 0)
+    z = np.sqrt(((quiet_power + air**2) / size).mean())
     print(
-        f"template, {n} draws: S/N {likely:.2f} of maximum likelihood, rms of deviates"
-        f" {rms[1]:.3f} +- {error:.3f}; {binned:.2f} +- {binned * error:.2f} of filter and bin;"
-        f" ratio {likely / binned:.2f}, by the scatter of both {likely / rms[1] / binned:.2f}"
+        f"ratio {ratio[1] / ratio[0]:.3f}; maximum likelihood states {np.sqrt(size).mean():.2f},"
+        f" rms of deviates {z:.3f}"
     )
 
 
