@@ -31,10 +31,9 @@ average over the samples of a baseline is neglected: it matters only where white
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +42,10 @@ from scipy import fft
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.kernels import kernel
-from zonda.core.numerics.random import normals, stream_key
 from zonda.core.observation import ClosedForm
 from zonda.core.types import Floats
+
+from .shared_modes import NOWHERE, leading_of, members, orthonormal
 
 BINS = 40
 """Bins of frequency, equal in its logarithm."""
@@ -57,10 +57,6 @@ FEWEST = 8
 """Frequencies that modes are found in at least."""
 FILLS = 40
 """Steps of the fit that fills baselines: what is left falls by the share of them that lack."""
-ITERATIONS = 40
-"""Products with the covariance in the search for its leading modes."""
-ALIKE = 1e-6
-"""Share of a gradient that is not that of other modes, below which it is one of them."""
 LEAST_LEFT = 0.1
 """Share of a detector's white noise that modes leave, from which its level is told."""
 WAVES, ANGLES = 60, 12
@@ -68,8 +64,6 @@ WAVES, ANGLES = 60, 12
 EVEN = 1e-5
 """Phase across the focal plane below which detectors see a wave alike: the gradients of longer
 waves have 1e-10 of their power, which is up to 1e9 times that of white noise."""
-NOWHERE = np.zeros((2, 0))
-"""Places of detectors that are not known."""
 
 
 @dataclass(frozen=True)
@@ -106,6 +100,8 @@ class BaselineNoise:
         (n_det,) number of the group with which each detector has modes in common: of a wafer, or 0.
     places
         (2, n_det) of the detectors in the focal plane, rad; (2, 0) where they are not known.
+    kept
+        (k,) true for modes that later estimates keep: the free ones, and gradients.
     """
 
     white: Floats
@@ -123,6 +119,7 @@ class BaselineNoise:
     freedom: Floats
     groups: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     places: Floats = field(default_factory=lambda: NOWHERE)
+    kept: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     @property
     def free_modes(self) -> Floats:
@@ -170,6 +167,7 @@ def estimate(
     lacking: NDArray[np.bool_] | None = None,
     groups: NDArray[np.intp] | None = None,
     places: Floats = NOWHERE,
+    remains: Floats | None = None,
 ) -> BaselineNoise:
     """Estimate the noise from baselines without a source, (n_det, n_base) [K].
 
@@ -186,20 +184,20 @@ def estimate(
     trend
         Degree of the polynomials of each detector's scan.
     fixed
-        (free, n_det) the free modes, where they are known.
+        (k, n_det) modes that are known.
     lacking
         (n_det, n_base) baselines that were `filled`: they have no noise of their own.
     groups
         (n_det,) see `BaselineNoise`; None: all detectors are one.
     places
         (2, n_det) see `BaselineNoise`.
+    remains
+        (n_bins,) share of the power of the noise that is in the residual; None: all.
     """
     n_det, n_base = residual.shape
     seen_of_each = np.count_nonzero(counted, axis=1)[:, None]
     lines = polynomials(n_base, trend)
-    scaled = residual / np.sqrt(white / length)[:, None]
-    take_lines(scaled, lines, counted)
-    powers = fft.rfft(scaled, axis=1) / np.sqrt(np.maximum(seen_of_each, 1))
+    powers = _spectra(residual, counted, white / length, lines)
     has = np.ones(n_det)
     if lacking is not None:
         has -= np.count_nonzero(lacking, axis=1) / np.maximum(seen_of_each[:, 0], 1)
@@ -210,24 +208,17 @@ def estimate(
     seen_in = [int(np.count_nonzero(seen_of_each[at])) for at in members(groups)]
     known = np.zeros((0, n_det)) if fixed is None else fixed
     numbers = [max(min(modes, n - 1), 0) for n in seen_in]
-    found = leading_of(groups, slow, numbers, known, places, free)
+    found, kept = leading_of(groups, slow, numbers, known, places, free, 1 / np.sqrt(white))
     free, modes = sum(max(min(free, modes, n - 1), 0) for n in seen_in), len(found)
     seen = np.einsum("kd,dt->kt", found, slow)
     values = np.einsum("kt,kt->k", seen, seen) / max(top - 1, 1)
     edges = bins_of(powers.shape[1])
-    own, least = np.empty((2, len(edges) - 1))
-    shared = np.empty((len(edges) - 1, modes))
     own_share = float(has[seen_of_each[:, 0] > 0].mean()) if n_seen else 1.0
-    amplitude = np.abs(_projected(powers, found)) ** 2
-    every = np.einsum("dt,dt->t", powers.real, powers.real)
-    every += np.einsum("dt,dt->t", powers.imag, powers.imag)
-    for k, (low, high) in enumerate(pairwise(edges.tolist())):
-        at = slice(max(low, 1), max(high, 2))
-        rest = (
-            (every[at] - amplitude[:, at].sum(axis=0)).mean() / max(n_seen - modes, 1) / own_share
-        )
-        least[k], own[k] = rest, max(rest, 1.0)
-        shared[k] = np.maximum(amplitude[:, at].mean(axis=1) - own[k], 0.0)
+    rest, amplitude = _power(powers, found, edges)
+    least = rest / (max(n_seen - modes, 1) * own_share)
+    if remains is not None:
+        least, amplitude = least / remains, amplitude / remains
+    own = np.maximum(least, 1.0)
     upper = powers[:, powers.shape[1] // 2 :]
     rest_of_each = upper - np.einsum("kd,kt->dt", found, _projected(upper, found))
     left = has - (found**2).sum(axis=0)  # of its white noise, without the modes
@@ -246,13 +237,14 @@ def estimate(
         middle,
         edges,
         own,
-        shared,
+        np.maximum(amplitude - own, 0.0).T,
         least,
         fast,
         np.where(edges[:-1] < (1 + LOWEST) / share, 0, 2 * np.diff(edges) * share)
         * max(n_seen - modes, 1),
         groups,
         places,
+        kept | (np.arange(modes) < free),
     )
 
 
@@ -297,7 +289,7 @@ def of_scene(
         row[at] = alike[at] / np.sqrt((alike[at] ** 2).sum())
     numbers = [int((found.modes[:, at] != 0).any(axis=1).sum()) for at in groups]
     weighed = columns * np.sqrt(np.einsum("f,fw->w", slow, powers))
-    q = leading_of(found.groups, weighed, numbers, first)
+    q, _ = leading_of(found.groups, weighed, numbers, first)
     spectra = np.einsum("fw,kw->fk", powers, np.einsum("kd,dw->kw", q, columns) ** 2)
     whole_power = np.einsum("fw,w->f", powers, (columns**2).sum(axis=0))
     rest = whole_power - spectra.sum(axis=1)
@@ -342,67 +334,43 @@ def _waves(
     return waves * (gain / plane.net[rows] / np.sqrt(2))[:, None], np.tile(density, (1, 2))
 
 
-def members(groups: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """The detectors of each group."""
-    return [np.flatnonzero(groups == number) for number in np.unique(groups)]
-
-
-def leading_of(
-    groups: NDArray[np.intp],
-    rows: Floats,
-    numbers: Sequence[int],
-    known: Floats,
-    places: Floats = NOWHERE,
-    free: int = 1,
+def what_remains(
+    rest: Floats, drawn: Floats, counted: NDArray[np.int32], noise: BaselineNoise
 ) -> Floats:
-    """`leading` vectors of each group, as many as its number, 0 for other detectors: the first of
-    all groups, then the second of all ...; some are ``known`` (k, n_det).
-
-    Where ``places`` are known, the gradients of the first are among three or more (see
-    `with_gradients`), of which so many are ``free``.
+    """(n_bins,) share of the power of baselines (n_det, n_base) that are ``drawn`` from a noise
+    model which is in their ``rest``, their map taken off; without modes.
     """
-    found = []
-    for number, at in zip(numbers, members(groups), strict=True):
-        own = known[(known[:, at] != 0).any(axis=1)][:number, at]
-        if places.size and number > 2:
-            own = with_gradients(rows[at], own, places[:, at], number, free)
-        vectors = np.zeros((number, len(rows)))
-        vectors[:, at] = leading(rows[at], number, own)
-        found += list(enumerate(vectors))
-    ordered = [vector for _, vector in sorted(found, key=itemgetter(0))]
-    return np.array(ordered).reshape(-1, len(rows))
+    unit = noise.white / noise.length
+    one, whole = (
+        _power(_spectra(y, counted, unit, noise.lines), noise.modes, noise.edges)[0]
+        for y in (rest, drawn)
+    )
+    return np.asarray(one / np.where(whole > 0, whole, np.inf))
 
 
-def with_gradients(rows: Floats, known: Floats, places: Floats, number: int, free: int) -> Floats:
-    """Vectors (at most ``number``, n_det) that lead ``rows`` (n_det, n), of which the first are
-    ``known``. Of u x and u y, u the leading vector and ``places`` (2, n_det) the detectors', which
-    long waves of the atmosphere make, those that are not among the known ones come next, unless
-    leading vectors of one half of the columns hold more of the others: these miss them by so much
-    that the atmosphere stays in the map. A free vector may then come before them. Where one of the
-    two alone is ``free``, or has room, it is that along which rows change most.
+def _spectra(
+    y: Floats, counted: NDArray[np.int32], unit: Floats, lines: Floats
+) -> NDArray[np.complex128]:
+    """Spectra (n_det, n) of baselines without lines, over white noise of variance ``unit`` (n_det,)
+    in the baselines that count.
     """
-    found = known if len(known) else leading(rows, 1, known)
-    middle = (found[:1] ** 2 * places).sum(axis=1, keepdims=True)
-    steep = found[:1] * (places - middle)
-    least = ALIKE * np.sqrt((steep**2).sum(axis=1))
-    while len(found) < number:
-        slopes = _orthonormal(np.concatenate([found, steep]), found)[len(found) :]
-        slopes = slopes[np.abs((slopes * steep).sum(axis=1)) > least]
-        last = len(found) + len(slopes)
-        if not len(slopes):
-            break
-        if len(found) < free < last or number < last:
-            seen = np.einsum("kd,dt->kt", slopes, rows)
-            axes = np.linalg.eigh(np.einsum("it,jt->ij", seen, seen))[1].T[::-1]
-            slopes = np.einsum("ij,jd->id", axes, slopes)[: number - len(found)]
-        others = leading(rows[:, ::2], len(found) + len(slopes), found)[len(found) :]
-        power = [(np.einsum("kd,dt->kt", v, rows[:, 1::2]) ** 2).sum() for v in (slopes, others)]
-        if power[0] > power[1]:
-            return np.concatenate([found, slopes])
-        if len(found) >= free:
-            break
-        found = leading(rows, len(found) + 1, found)
-    return found if len(found) > max(len(known), 1) else known
+    scaled = y / np.sqrt(unit)[:, None]
+    take_lines(scaled, lines, counted)
+    seen = np.maximum(np.count_nonzero(counted, axis=1), 1)[:, None]
+    return np.asarray(fft.rfft(scaled, axis=1) / np.sqrt(seen))
+
+
+def _power(
+    powers: NDArray[np.complex128], modes: Floats, edges: NDArray[np.intp]
+) -> tuple[Floats, Floats]:
+    """Means over bins: power beside the modes, (n_bins,), and of each mode, (k, n_bins)."""
+    amplitude = np.abs(_projected(powers, modes)) ** 2
+    every = np.einsum("dt,dt->t", powers.real, powers.real)
+    every += np.einsum("dt,dt->t", powers.imag, powers.imag)
+    rows = np.concatenate([(every - amplitude.sum(axis=0))[None], amplitude])
+    bins = [slice(max(low, 1), max(high, 2)) for low, high in pairwise(edges.tolist())]
+    means = np.stack([rows[:, at].mean(axis=1) for at in bins], axis=1)
+    return means[0], means[1:]
 
 
 def filled(
@@ -451,32 +419,7 @@ def polynomials(n: int, degree: int) -> Floats:
     """Orthonormal polynomials (degree + 1, n) up to a degree."""
     x = np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
     powers = np.array([x**power for power in range(min(degree + 1, n))])
-    return _orthonormal(powers, np.zeros((0, n)))
-
-
-def leading(rows: Floats, number: int, known: Floats) -> Floats:
-    """Leading left singular vectors (number, n_det) of ``rows`` (n_det, n), of which the first are
-    ``known`` (k, n_det). Each has a positive sum.
-    """
-    n_det = len(rows)
-    start = normals(stream_key(0, "MaximumLikelihoodMap", 0), 0, number * n_det)
-    vectors = _orthonormal(start.reshape(number, n_det).astype(np.float64), known)
-    for _ in range(ITERATIONS):
-        times = np.einsum("kd,dt->kt", vectors, rows)
-        vectors = _orthonormal(np.einsum("kt,dt->kd", times, rows), known)
-    return np.where(vectors.sum(axis=1, keepdims=True) < 0, -vectors, vectors)
-
-
-def _orthonormal(vectors: Floats, known: Floats) -> Floats:
-    """Gram-Schmidt, in the order of the vectors; the first are ``known``."""
-    found = list(known)[: len(vectors)]
-    for row in vectors[len(found) :]:
-        for _ in range(2):
-            for other in found:
-                row = row - (row * other).sum() * other
-        size = np.sqrt((row * row).sum())
-        found.append(row / size if size > 0 else np.zeros_like(row))
-    return np.array(found).reshape(len(vectors), vectors.shape[1])
+    return orthonormal(powers, np.zeros((0, n)))
 
 
 @kernel

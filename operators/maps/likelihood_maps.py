@@ -21,7 +21,7 @@ from zonda.core.output import publish
 from zonda.core.signal import MAIN, Signal, product_name
 from zonda.core.types import Floats
 
-from .baseline_noise import estimate
+from .baseline_noise import estimate, what_remains
 from .grid import Grid
 from .intensity_kernel import VALUE
 from .map_from_sums import MapFromSums
@@ -73,15 +73,17 @@ class LikelihoodSystem:
         """Normal equations of all scans, with the noise of data minus the map."""
         found = self._of([WeighedScan(one.scan, one.noise) for one in self.scans.scans])
         step, first = self.parameters, self.parts[0][2].first
-        for _ in range(step.refined):
-            solution = self._solve(found, first)
+        for turn in range(step.refined):
+            solution = self._solve(found, self.right_side(found, first), "noise")
+            drawn = self._solve(found, found.drawn(turn), "noise, a draw")
             scans = []
             for k, (one, (scan, noise)) in enumerate(
                 zip(self.scans.scans, found.scans, strict=True)
             ):
-                y = one.data[first][0] - found.baselines(solution, k)
+                y, of_draw = one.data[first][0], found.draw(turn, k)[1]
+                rest = of_draw - found.baselines(drawn, k)
                 new = estimate(
-                    y,
+                    y - found.baselines(solution, k),
                     scan.counted,
                     noise.white,
                     scan.length,
@@ -89,10 +91,11 @@ class LikelihoodSystem:
                     modes=step.modes,
                     free=step.free,
                     trend=step.trend,
-                    fixed=noise.modes[: noise.free],
+                    fixed=noise.modes[noise.kept],
                     lacking=scan.lacking,
                     groups=noise.groups,
                     places=noise.places,
+                    remains=what_remains(rest, of_draw, scan.counted, noise),
                 )
                 if step.noise != "estimated":
                     new = replace(new, own=noise.own)  # that of a table
@@ -132,16 +135,15 @@ class LikelihoodSystem:
         if key in self._solutions:
             return self._solutions[key]
         equations = self.equations if half is None else self.equations_of_halves[half]
-        found = self._solve(equations, stream, half)
+        what = product_name(stream, "map") + ("" if half is None else f", half {half + 1}")
+        found = self._solve(equations, self.right_side(equations, stream, half), what)
         if len(self.parts) > 1:
             self._solutions[key] = found
         return found
 
-    def _solve(self, equations: NormalEquations, stream: str, half: int | None = None) -> Solution:
-        right = self.right_side(equations, stream, half)
+    def _solve(self, equations: NormalEquations, right: Floats, what: str) -> Solution:
+        """The solution of a right side; ``what`` progress calls it."""
         step, told = self.parameters, [0]
-        what = product_name(stream, "map") if "equations" in vars(self) else "noise"
-        what += "" if half is None else f", half {half + 1}"
 
         def tell(residual: float) -> None:
             share = np.log(max(residual, step.tolerance)) / np.log(step.tolerance)

@@ -17,7 +17,7 @@ from zonda.core.polarization import PolarizationAngles
 from zonda.core.signal import MAIN
 from zonda.core.types import AnyFloats, Floats
 
-from .baseline_noise import BaselineNoise, estimate, filled, members, of_scene, of_table
+from .baseline_noise import BaselineNoise, estimate, filled, of_scene, of_table
 from .bin_map import Prepared
 from .binning import Weights, binnings
 from .compressed_scan import Keeps, RunsOfTiles, Tile, add_baselines, add_groups
@@ -25,6 +25,7 @@ from .grid import Looking
 from .intensity_kernel import VALUE, WEIGHT
 from .normal_equations import Compressed
 from .parameters import LikelihoodParameters
+from .shared_modes import members
 
 if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.numerics.random import stream_key
 from zonda.core.product import Product
 from zonda.core.stream import forget_pages, in_order
 from zonda.core.types import Floats
@@ -39,6 +40,7 @@ from zonda.core.types import Floats
 from .baseline_noise import BaselineNoise
 from .compressed_scan import CompressedScan
 from .map_from_sums import SINGULAR, TRIANGLE
+from .noise_draw import draw
 from .preconditioner import PATTERNS, UNDETERMINED, SmoothPatterns
 from .stokes_kernel import PLACES
 
@@ -250,6 +252,22 @@ class NormalEquations:
             out[0, gaps] = scan.in_gaps(y / noise.white[:, None])
         return out + self._added(data.__getitem__)
 
+    def draw(self, number: int, k: int) -> tuple[Floats, Floats, Floats]:
+        """Draw of the noise of scan k, see `noise_draw`; ``number`` of the draw."""
+        key = stream_key(0, "MaximumLikelihoodMap", "draw", number, k)
+        return draw(*self.scans[k], self.n_stokes, key)
+
+    def drawn(self, number: int) -> Floats:
+        """Right side of a draw of the noise, of map and gaps."""
+
+        def one(k: int) -> Floats:
+            scan, noise = self.scans[k]
+            out, y, s = self.draw(number, k)
+            out[0, self.n_pixels :] = scan.in_gaps(y / noise.white[:, None])
+            return out + self.scans[k].spread(y, s, self.n_stokes)
+
+        return self._sum(one)
+
     def apply(self, m: Floats, own: slice = slice(None)) -> Floats:
         """P^T Q P m, Q of the samples that count; ``own``: as of `eliminated`."""
         return self.eliminated(self._product(self._widened(m)), own)
@@ -358,13 +376,18 @@ class NormalEquations:
                 forget_pages(array)
             return found
 
+        total = self._sum(one)
+        self.work.products += 1
+        self.work.seconds += sum(seconds)
+        return total
+
+    def _sum(self, one: Callable[[int], Floats]) -> Floats:
+        """Maps with gaps of ``one`` scan k, added up in order."""
         total, number = np.zeros((self.n_stokes, self._ends[-1])), len(self.scans)
         parts = in_order(one, ((k,) for k in range(number)), min(self.threads, number))
         for k, part in enumerate(parts):
             total[:, : self.n_pixels] += part[:, : self.n_pixels]
             total[:, self._ends[k] : self._ends[k + 1]] = part[:, self.n_pixels :]
-        self.work.products += 1
-        self.work.seconds += sum(seconds)
         return total
 
 

@@ -220,8 +220,8 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
             "each scan is read twice: for runs, baselines and noise; for sums and free modes",
             f"compressed scans take {size / 1e9:.3g} GB {where}, with baselines of"
             f" {step.baseline_of(longest):.3g} s, {kept}",
-            f"{self._solutions(longest)} solutions by conjugate gradients, {step.refined} of them"
-            " for the noise",
+            f"{self._solutions(longest)} solutions by conjugate gradients, {2 * step.refined} of"
+            " them for the noise",
         ]
 
     def finishing(
@@ -278,7 +278,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """Solutions over all samples; two halves are one."""
         step = self.operator
         signals = len({*observation.signals} - observation.unfiltered)
-        return step.refined + signals * (1 + bool(step.half_difference))
+        return 2 * step.refined + signals * (1 + bool(step.half_difference))
 
     def sweeps(self, observation: Observation) -> int:
         """One reading finds runs and baselines."""

@@ -270,7 +270,7 @@ def test_a_signal_has_its_bits_without_others(ample, tmp_path):
 
 
 def test_iterations_show_their_progress(tmp_path):
-    """For the noise, both signals and their halves: shares of the way to the tolerance rise to all of it."""
+    """For the noise and a draw of it, both signals and their halves: shares of the way to the tolerance rise to all of it."""
     seen = {}
 
     class Hears:
@@ -288,7 +288,7 @@ def test_iterations_show_their_progress(tmp_path):
     both = [
         f"{name}{half}" for name in ("map", "quiet/map") for half in ("", ", half 1", ", half 2")
     ]
-    assert list(seen) == ["noise", *both]
+    assert list(seen) == ["noise", "noise, a draw", *both]
     for shares in seen.values():
         assert shares == sorted(shares)
         assert shares[-1] == 1

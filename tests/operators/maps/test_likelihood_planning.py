@@ -83,8 +83,8 @@ def test_runs_are_counted_on_the_grid(projection):
     ("how", "half", "solutions"),
     [
         ({"refine": 0}, False, 1),
-        ({}, False, 2),
-        ({"refine": 2}, True, 4),
+        ({}, False, 3),
+        ({"refine": 2}, True, 6),
         ({"noise": "simulated"}, False, 1),
     ],
 )

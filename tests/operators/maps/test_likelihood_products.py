@@ -149,12 +149,13 @@ def test_the_noise_model_has_files_and_pictures(found):
 
 def test_a_template_in_white_noise(found):
     """A is at most the matrix of white noise, sum (t / n)^2; a line of each detector, and slow
-    baselines that are found a little noisier than they are, take some of it."""
+    baselines that are found up to 15 % noisier than they are (bins of 40 detectors, at least as
+    noisy as white noise), take some of it."""
     t, m, free = (found[f"{name}map"] for name in ("model/", "", "free/"))
     one, error = matched(t, t)
     assert one == pytest.approx(1, abs=1e-12)
     white = np.sqrt(np.nansum((t.signal / t.noise) ** 2))
-    assert 0.9 * white < 1 / error < white
+    assert 0.8 * white < 1 / error < white
     noise = matched(t, free)
     assert abs(noise[0]) < 4 * error
     # the map is linear in its data, solved to 1e-6 of a right side of 200 sigma

@@ -6,11 +6,12 @@ import healpy
 import numpy as np
 import pytest
 
-from zonda.operators.maps.baseline_noise import BaselineNoise, leading, polynomials
+from zonda.operators.maps.baseline_noise import BaselineNoise, polynomials
 from zonda.operators.maps.compressed_scan import RunsOfTiles, Tile
 from zonda.operators.maps.grid import HealpixGrid, TangentGrid
 from zonda.operators.maps.normal_equations import NormalEquations, WeighedScan
 from zonda.operators.maps.preconditioner import orthonormal
+from zonda.operators.maps.shared_modes import leading
 
 SIDE, N_DET, N, LENGTH, RATE = 28, 6, 4000, 8, 40.0
 GRID = TangentGrid((0.0, 0.0), 1e-3, (SIDE, SIDE))
