@@ -42,6 +42,7 @@ from scipy import fft
 from zonda.core.data import Observation
 from zonda.core.errors import PipelineError
 from zonda.core.kernels import kernel
+from zonda.core.numerics.random import Key, normals
 from zonda.core.observation import ClosedForm
 from zonda.core.types import Floats
 
@@ -136,6 +137,19 @@ class BaselineNoise:
             groups=self.groups[rows],
             places=self.places[:, rows],
         )
+
+    def draw(self, n_base: int, key: Key) -> Floats:
+        """Draw of the noise of baselines beside white noise (n_det, n_base), K: the detectors' own,
+        and modes that are not free. ``key``: of the random numbers.
+        """
+        n_det, bins = len(self.white), np.repeat(np.arange(len(self.own)), np.diff(self.edges))
+        own = normals(key, 0, n_det * n_base, n_det).reshape(n_det, n_base).astype(np.float64)
+        found = fft.rfft(own, axis=1) * np.sqrt(self.own[bins] - 1)
+        for k in range(self.free, len(self.modes)):
+            shared = fft.rfft(normals(key, 0, n_base, n_det + 1 + k).astype(np.float64))
+            found += self.modes[k][:, None] * (np.sqrt(self.shared[bins, k]) * shared)
+        g = np.sqrt(self.white / self.length)[:, None]
+        return np.asarray(g * fft.irfft(found, n_base, axis=1))
 
     def weigh(self, y: Floats, counted: NDArray[np.int32]) -> Floats:
         """Q_b y of baselines (n_det, n_base), of which so many samples are ``counted``."""

@@ -48,7 +48,7 @@ PART = 1 << 25
 
 
 class Keeps(IntEnum):
-    """Where runs are kept; or nowhere, and found anew."""
+    """A place of runs: memory, files, or none, where they are found anew."""
 
     MEMORY = 0
     FILES = 1

@@ -223,7 +223,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
 
     @property
     def _where(self) -> str:
-        """Where compressed scans are, in words; empty for memory."""
+        """Place of compressed scans, in words; empty for memory."""
         files = "in temporary files" if self._in_files else ""
         if self._keeps is not Keeps.AGAIN:
             return files

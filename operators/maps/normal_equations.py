@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from zonda.core.numerics.random import stream_key
+from zonda.core.numerics.random import Key, normals, stream_key
 from zonda.core.product import Product
 from zonda.core.stream import forget_pages, in_order
 from zonda.core.types import Floats
@@ -40,7 +40,6 @@ from zonda.core.types import Floats
 from .baseline_noise import BaselineNoise
 from .compressed_scan import CompressedScan
 from .map_from_sums import SINGULAR, TRIANGLE
-from .noise_draw import draw
 from .preconditioner import PATTERNS, UNDETERMINED, SmoothPatterns
 from .stokes_kernel import PLACES
 
@@ -121,6 +120,36 @@ class WeighedScan(NamedTuple):
         slow -= within
         scan.spread(slow, -s, noise.free_modes, found)
         return found
+
+    def draw(self, n_stokes: int, key: Key) -> tuple[Floats, Floats, Floats]:
+        """P^T n / sigma^2 (n_stokes, scan.width), baselines y and free streams s of a draw n of the
+        noise: white noise, baselines and shared modes; free modes, of which maps see nothing, are
+        left out. ``key``: of the random numbers, which count the samples of each detector.
+        """
+        scan, noise = self
+        n_base, a = scan.shape[1], noise.free_modes
+        binned, y = np.zeros((n_stokes, scan.width)), noise.draw(n_base, key)
+        s = np.zeros((len(a), scan.n_samples))
+        base = np.repeat(np.arange(n_base), scan.length)[: scan.n_samples]
+        for some, (first, pixel, samples, angles, _) in scan.parts():
+            for row, d in enumerate(range(some.start, some.stop)):
+                begins = first[row * n_base : (row + 1) * n_base + 1]
+                runs = slice(begins[0], begins[-1])
+                at, number = pixel[runs], samples[runs].astype(np.intp)
+                seen = at < scan.n_pixels
+                counts = np.repeat(seen, number)
+                white = normals(key, 0, scan.n_samples, d) * np.sqrt(noise.white[d]) * counts
+                total = np.add.reduceat(white, np.cumsum(number) - number)
+                mean = np.add.reduceat(total, begins[:-1] - begins[0])
+                mean /= np.maximum(scan.known[d], 1)
+                s += a[:, d, None] * (white - counts * mean[base])
+                total += seen * number * np.repeat(y[d], np.diff(begins))
+                y[d] += mean
+                weight = total[seen] / noise.white[d]
+                binned[0] += np.bincount(at[seen], weight, scan.width)
+                for out, angle in zip(binned[1:], angles[:, runs], strict=False):
+                    out += np.bincount(at[seen], weight * angle[seen], scan.width)
+        return binned, y, s
 
     def square(self, y: Floats, s: Floats) -> float:
         """Sum d^T Q d of the complete signal, whose y and s these are."""
@@ -253,12 +282,19 @@ class NormalEquations:
         return out + self._added(data.__getitem__)
 
     def draw(self, number: int, k: int) -> tuple[Floats, Floats, Floats]:
-        """Draw of the noise of scan k, see `noise_draw`; ``number`` of the draw."""
+        """Draw of the noise of scan k, as `WeighedScan.draw`; ``number`` of the draw."""
         key = stream_key(0, "MaximumLikelihoodMap", "draw", number, k)
-        return draw(*self.scans[k], self.n_stokes, key)
+        return self.scans[k].draw(self.n_stokes, key)
 
     def drawn(self, number: int) -> Floats:
-        """Right side of a draw of the noise, of map and gaps."""
+        """Right side of a draw of the noise, of map and gaps. A map takes a part of the noise with
+        it: m of noise n with the inverse covariance Q has the covariance (P^T Q P)^-1, and
+
+            <(n - P m) (n - P m)^T> = Q^-1 - <P m (P m)^T>.                              (2)
+
+        Spectra of data minus their map are too low by those of P m, in a short scan by half. The
+        map of a draw tells by how much (restricted maximum likelihood, Patterson & Thompson 1971).
+        """
 
         def one(k: int) -> Floats:
             scan, noise = self.scans[k]

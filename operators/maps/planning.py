@@ -259,7 +259,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         return self.operator.model_copy(update=few)
 
     def counted(self, observations: Sequence[Observation]) -> MaximumLikelihoodMap:
-        """All iterations, on pixels so large that there are few."""
+        """The step with all iterations, on pixels so large that there are few."""
         step = self.operator
         layout = MapLayout(step)
         pixels = layout.grid(layout.place(observations, {})).n_pixels

@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zonda.core.numerics.random import normals, stream_key
-from zonda.core.types import Floats
+from zonda.core.types import Bools, Floats, Indices
 
 CLEAR = 2.0
 """Power of what all detectors see alike over the mean over directions, from which it is a mode."""
+PATTERN = 1.4
+"""Power of a leading vector over that of noise, from which it is a pattern: beside gradients it is
+0.98 to 1.04 for MUSTANG-2, and 1.8 for AtLAST, whose focal plane waves cross within a second."""
 TINY = 1e-300
 ITERATIONS = 40
 """Products with the covariance in the search for its leading modes."""
@@ -24,36 +27,33 @@ NOWHERE = np.zeros((2, 0))
 """Places of detectors that are not known."""
 
 
-def members(groups: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def members(groups: Indices) -> list[NDArray[np.intp]]:
     """The detectors of each group."""
     return [np.flatnonzero(groups == number) for number in np.unique(groups)]
 
 
 def leading_of(
-    groups: NDArray[np.intp],
+    groups: Indices,
     rows: Floats,
     numbers: Sequence[int],
     known: Floats,
     places: Floats = NOWHERE,
     free: int = 1,
     alike: Floats | None = None,
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> tuple[Floats, Bools]:
     """`leading` vectors of each group, as many as its number, 0 for other detectors: the first of
     all groups, then the second of all ...; some are ``known`` (k, n_det).
 
-    Where ``places`` are known, the gradients of the first are among three or more (see
-    `with_gradients`), of which so many are ``free``; the first is ``alike`` (n_det,), if given,
-    where it and its gradients hold as much as the leading one and its gradients. Returns the
-    vectors, and true for those up to the gradients.
+    Where ``places`` are known, those of `with_gradients` are first among three or more, of which so
+    many are ``free``. Returns the vectors, and true for those up to the gradients.
     """
     found = []
     for number, at in zip(numbers, members(groups), strict=True):
         own = known[(known[:, at] != 0).any(axis=1)][:number, at]
         steady = 0
         if places.size and number > 2:
-            if not len(own) and alike is not None:
-                own = first_of(rows[at], alike[at], places[:, at])
-            own, steady = with_gradients(rows[at], own, places[:, at], number, free)
+            same = None if alike is None else alike[at]
+            own, steady = with_gradients(rows[at], own, places[:, at], number, free, same)
         vectors = np.zeros((number, len(rows)))
         vectors[:, at] = leading(rows[at], number, own)
         found += [(k, vector, k < steady) for k, vector in enumerate(vectors)]
@@ -62,63 +62,63 @@ def leading_of(
     return np.array([vector for _, vector, _ in ordered]).reshape(-1, len(rows)), kept
 
 
-def first_of(rows: Floats, alike: Floats, places: Floats) -> Floats:
-    """``alike`` (1, n_det), with size 1, where it and its gradients hold no less of one half of the
-    columns of ``rows`` (n_det, n) than the leading vector of the other and its gradients, and it is
-    above their mean over directions; else none (0, n_det).
-
-    A leading vector is tilted by chance, as gradients of a short scan look like its common mode.
-    The free mode is then not what all see alike: a part of the fast common noise stays in the map.
-    """
-    vectors = orthonormal(alike[None], np.zeros((0, len(rows))))
-    half, held = rows[:, 1::2], []
-    for first in (vectors, leading(rows[:, ::2], 1, vectors[:0])):
-        span = orthonormal(np.concatenate([first, _steep(first, places)]), first)
-        held.append((np.einsum("kd,dt->kt", span, half) ** 2).sum(axis=1))
-    clear = held[0][0] > CLEAR * np.mean(half**2) * half.shape[1]
-    return vectors if clear and held[0].sum() >= held[1].sum() else vectors[:0]
-
-
-def _steep(first: Floats, places: Floats) -> Floats:
-    """Gradients (2, n_det) of a vector (1, n_det)."""
-    return np.asarray(first * (places - (first**2 * places).sum(axis=1, keepdims=True)))
-
-
 def with_gradients(
-    rows: Floats, known: Floats, places: Floats, number: int, free: int
+    rows: Floats,
+    known: Floats,
+    places: Floats,
+    number: int,
+    free: int,
+    alike: Floats | None = None,
 ) -> tuple[Floats, int]:
-    """Vectors (at most ``number``, n_det) that lead ``rows`` (n_det, n), of which the first are
-    ``known``: at least the leading one u. Of u x and u y of the detectors' ``places`` (2, n_det),
-    which long waves of the atmosphere make, those that are not among them come next: leading
-    vectors that are found in the noise of the streams miss these by so much that the atmosphere
-    stays in the map. Before them come further leading vectors, as long as those of one half of the
-    columns hold more of the others. Columns count alike, without the vectors before: else the
-    slowest noise of the detectors decides. Where one of the two alone is ``free``, or has room, it
-    is that along which rows change most. Returns also the number of vectors up to the gradients, 0
-    where these are not among them.
+    """First vectors (at most ``number``, n_det) of what detectors share in ``rows`` (n_det, n), of
+    which some are ``known``; and their number, 0 where these are the known ones alone.
+
+    They are what all see ``alike`` (n_det,), or one leading vector or more; and u x and u y, u the
+    first and ``places`` (2, n_det) the detectors', as long waves of the atmosphere make them.
+    Leading vectors that are found in noise miss the gradients by so much that the atmosphere stays
+    in the map. Gradients of a short scan look like its common mode by chance: u is then tilted, and
+    fast common noise stays, too. The first of these is taken beside which there is `noise_alone`.
+    Where one gradient alone is ``free``, or has room, it is that along which rows change most.
     """
-    found = known if len(known) else leading(rows, 1, known)
-    steep = _steep(found[:1], places)
-    least = ALIKE * np.sqrt((steep**2).sum(axis=1))
-    while True:
-        rest = rows - np.einsum("kd,kt->dt", found, np.einsum("kd,dt->kt", found, rows))
-        rest /= np.sqrt(np.maximum((rest**2).sum(axis=0), TINY))
-        slopes = orthonormal(np.concatenate([found, steep]), found)[len(found) :]
-        slopes = slopes[np.abs((slopes * steep).sum(axis=1)) > least]
-        last = len(found) + len(slopes)
-        if not len(slopes):
-            return found, len(found)
-        if len(found) >= number:
-            return found, 0
-        if len(found) < free < last or number < last:
-            seen = np.einsum("kd,dt->kt", slopes, rows)
-            axes = np.linalg.eigh(np.einsum("it,jt->ij", seen, seen))[1].T[::-1]
-            slopes = np.einsum("ij,jd->id", axes, slopes)[: number - len(found)]
-        others = leading(rest[:, ::2], len(found) + len(slopes), found)[len(found) :]
-        power = [(np.einsum("kd,dt->kt", v, rest[:, 1::2]) ** 2).sum() for v in (slopes, others)]
-        if power[0] > power[1]:
-            return np.concatenate([found, slopes]), len(found) + len(slopes)
-        found = leading(rows, len(found) + 1, found)
+    firsts = [(known, number)] if len(known) else [(leading(rows, 1, known), number)]
+    if alike is not None and not len(known):
+        same = orthonormal(alike[None], known)
+        if (np.einsum("kd,dt->kt", same, rows) ** 2).sum() > CLEAR * (rows**2).sum() / len(rows):
+            firsts.insert(0, (same, 1))
+    for found, most in firsts:
+        steep = found[:1] * (places - (found[:1] ** 2 * places).sum(axis=1, keepdims=True))
+        least = ALIKE * np.sqrt((steep**2).sum(axis=1))
+        while True:
+            slopes = orthonormal(np.concatenate([found, steep]), found)[len(found) :]
+            slopes = slopes[np.abs((slopes * steep).sum(axis=1)) > least]
+            last = len(found) + len(slopes)
+            if not len(slopes):
+                return found, len(found)
+            if len(found) >= number:
+                break
+            if len(found) < free < last or number < last:
+                seen = np.einsum("kd,dt->kt", slopes, rows)
+                axes = np.linalg.eigh(np.einsum("it,jt->ij", seen, seen))[1].T[::-1]
+                slopes = np.einsum("ij,jd->id", axes, slopes)[: number - len(found)]
+            every = np.concatenate([found, slopes])
+            if noise_alone(rows, every):
+                return every, len(every)
+            if len(found) >= most:
+                break
+            found = leading(rows, len(found) + 1, found)
+    return known, 0
+
+
+def noise_alone(rows: Floats, vectors: Floats) -> bool:
+    """True if ``rows`` (n_det, n) have no pattern beside orthonormal ``vectors`` (k, n_det): with
+    columns of equal size, the leading one holds no more than that of white noise, (sqrt(n_det) +
+    sqrt(n))^2 times the variance (Marchenko & Pastur 1967).
+    """
+    rest = rows - np.einsum("kd,kt->dt", vectors, np.einsum("kd,dt->kt", vectors, rows))
+    rest /= np.sqrt(np.maximum((rest**2).mean(axis=0), TINY))
+    first = leading(rest, 1, vectors[:0])
+    edge = (np.sqrt(rest.shape[0]) + np.sqrt(rest.shape[1])) ** 2
+    return bool((np.einsum("kd,dt->kt", first, rest) ** 2).sum() < PATTERN * edge)
 
 
 def leading(rows: Floats, number: int, known: Floats) -> Floats:

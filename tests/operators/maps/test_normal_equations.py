@@ -16,9 +16,8 @@ from zonda.operators.maps.baseline_noise import (
     what_remains,
 )
 from zonda.operators.maps.compressed_scan import Keeps, RunsOfTiles, Tile, add_baselines
-from zonda.operators.maps.noise_draw import draw
 from zonda.operators.maps.normal_equations import NormalEquations, WeighedScan
-from zonda.operators.maps.shared_modes import first_of, leading, leading_of
+from zonda.operators.maps.shared_modes import leading, leading_of, with_gradients
 
 N_DET, N, LENGTH, N_PIX, RATE = 5, 144, 6, 40, 6.0
 
@@ -364,18 +363,24 @@ def test_gradients_stand_beside_free_modes_in_every_estimate(free):
 
 def test_the_first_mode_is_what_all_see_alike_unless_gains_differ():
     """A gradient that goes with the common mode by chance, as in a short scan, tilts the leading
-    vector, and not the first mode; gains of 2 % are found; of white noise there is no mode.
+    vector, and not the first mode; gains of 2 % are found; white noise has no such mode.
     """
     rng = np.random.default_rng(13)
     n_det, n = 80, 400
-    places = rng.uniform(-1, 1, (2, n_det))
+    places, none = rng.uniform(-1, 1, (2, n_det)), np.zeros((0, n_det))
     alike, common, white = np.ones(n_det), rng.normal(size=n), rng.normal(size=(n_det, n))
+
+    def first_of(rows):
+        return with_gradients(rows, none, places, 3, 1, alike)[0][0] * n_det**0.5
+
     tilted = np.outer(1e3 * (1 + 0.01 * places[0]), common) + white
-    np.testing.assert_allclose(first_of(tilted, alike, places)[0], n_det**-0.5)
-    assert np.ptp(leading(tilted, 1, np.zeros((0, n_det)))) > 0.01 * n_det**-0.5
+    np.testing.assert_allclose(first_of(tilted), 1)
+    assert np.ptp(leading(tilted, 1, none)) > 0.01 * n_det**-0.5
     gains = 1 + 0.02 * rng.normal(size=n_det)
-    assert not len(first_of(np.outer(1e3 * gains, common) + white, alike, places))
-    assert not len(first_of(white, alike, places))
+    found = first_of(np.outer(1e3 * gains, common) + white)
+    # the noise of a leading vector: 1 / (1e3 sqrt(n))
+    np.testing.assert_allclose(found, gains * np.sqrt(n_det / (gains**2).sum()), atol=4e-4)
+    assert np.ptp(first_of(white)) > 0.1
 
 
 @pytest.mark.parametrize("polarized", [False, True])
@@ -396,7 +401,7 @@ def test_draws_of_the_noise_have_the_covariance_of_the_right_side(flagged, polar
     along = np.einsum("nsp,msp->nm", found, maps) / np.sqrt(power)
     # chi^2 of 300 degrees of freedom: 0.08; four errors of one of 12
     np.testing.assert_allclose((along**2).mean(axis=0), 1, atol=4 * np.sqrt(2 / number))
-    one = draw(scan, noise, size, stream_key(1, "draw"))
+    one = WeighedScan(scan, noise).draw(size, stream_key(1, "draw"))
     assert [part.shape for part in one] == [(size, scan.width), scan.shape, (1, N)]
 
 
