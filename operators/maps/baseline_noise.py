@@ -56,6 +56,8 @@ SLOW = 1.0
 """Modes are those of baselines below this frequency, Hz."""
 FEWEST = 8
 """Frequencies that modes are found in at least."""
+POOLED = np.ones(9)
+"""Weights of neighbouring bins, of which a share is that of the sum."""
 FILLS = 40
 """Steps of the fit that fills baselines: what is left falls by the share of them that lack."""
 LEAST_LEFT = 0.1
@@ -206,7 +208,7 @@ def estimate(
     places
         (2, n_det) see `BaselineNoise`.
     remains
-        (n_bins,) share of the power of the noise that is in the residual; None: all.
+        (n_bins,) share of the detectors' own power that is in the residual; None: all.
     """
     n_det, n_base = residual.shape
     seen_of_each = np.count_nonzero(counted, axis=1)[:, None]
@@ -222,7 +224,8 @@ def estimate(
     seen_in = [int(np.count_nonzero(seen_of_each[at])) for at in members(groups)]
     known = np.zeros((0, n_det)) if fixed is None else fixed
     numbers = [max(min(modes, n - 1), 0) for n in seen_in]
-    found, kept = leading_of(groups, slow, numbers, known, places, free, 1 / np.sqrt(white))
+    alike = np.where(seen_of_each[:, 0] > 0, 1 / np.sqrt(white), 0.0)
+    found, kept = leading_of(groups, slow, numbers, known, places, free, alike)
     free, modes = sum(max(min(free, modes, n - 1), 0) for n in seen_in), len(found)
     seen = np.einsum("kd,dt->kt", found, slow)
     values = np.einsum("kt,kt->k", seen, seen) / max(top - 1, 1)
@@ -230,8 +233,9 @@ def estimate(
     own_share = float(has[seen_of_each[:, 0] > 0].mean()) if n_seen else 1.0
     rest, amplitude = _power(powers, found, edges)
     least = rest / (max(n_seen - modes, 1) * own_share)
+    shared = np.maximum(amplitude - np.maximum(least, 1.0), 0.0).T
     if remains is not None:
-        least, amplitude = least / remains, amplitude / remains
+        least = least / remains
     own = np.maximum(least, 1.0)
     upper = powers[:, powers.shape[1] // 2 :]
     rest_of_each = upper - np.einsum("kd,kt->dt", found, _projected(upper, found))
@@ -251,7 +255,7 @@ def estimate(
         middle,
         edges,
         own,
-        np.maximum(amplitude - own, 0.0).T,
+        shared,
         least,
         fast,
         np.where(edges[:-1] < (1 + LOWEST) / share, 0, 2 * np.diff(edges) * share)
@@ -352,14 +356,16 @@ def what_remains(
     rest: Floats, drawn: Floats, counted: NDArray[np.int32], noise: BaselineNoise
 ) -> Floats:
     """(n_bins,) share of the power of baselines (n_det, n_base) that are ``drawn`` from a noise
-    model which is in their ``rest``, their map taken off; without modes.
+    model which is in their ``rest``, their map taken off; without modes. It changes slowly with
+    frequency, and is that of `POOLED` bins on each side; at most 1.
     """
     unit = noise.white / noise.length
-    one, whole = (
-        _power(_spectra(y, counted, unit, noise.lines), noise.modes, noise.edges)[0]
-        for y in (rest, drawn)
-    )
-    return np.asarray(one / np.where(whole > 0, whole, np.inf))
+    number = np.diff(noise.edges)
+    spectra = (_spectra(y, counted, unit, noise.lines) for y in (rest, drawn))
+    powers = (_power(found, noise.modes, noise.edges)[0] for found in spectra)
+    one, whole = (np.convolve(number * power, POOLED) for power in powers)
+    some = slice(len(POOLED) // 2, len(POOLED) // 2 + number.size)
+    return np.minimum(one[some] / np.where(whole[some] > 0, whole[some], np.inf), 1.0)
 
 
 def _spectra(

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from zonda.core.kernels import kernel
 from zonda.core.numerics.random import Key, normals, stream_key
 from zonda.core.product import Product
 from zonda.core.stream import forget_pages, in_order
@@ -145,10 +146,10 @@ class WeighedScan(NamedTuple):
                 s += a[:, d, None] * (white - counts * mean[base])
                 total += seen * number * np.repeat(y[d], np.diff(begins))
                 y[d] += mean
-                weight = total[seen] / noise.white[d]
-                binned[0] += np.bincount(at[seen], weight, scan.width)
+                total *= seen / noise.white[d]
+                add_to(binned[0], at, total)
                 for out, angle in zip(binned[1:], angles[:, runs], strict=False):
-                    out += np.bincount(at[seen], weight * angle[seen], scan.width)
+                    add_to(out, at, total * angle)
         return binned, y, s
 
     def square(self, y: Floats, s: Floats) -> float:
@@ -162,7 +163,8 @@ class WeighedScan(NamedTuple):
         """Degrees of freedom of the samples: those that neither free modes nor polynomials take."""
         scan, noise = self
         samples = scan.known.sum(axis=1)
-        free = float(((noise.modes[: noise.free] ** 2).sum(axis=0) * samples).sum())
+        of_mode = scan.counted.sum(axis=1)  # of gaps too: one value at each instant
+        free = float(((noise.modes[: noise.free] ** 2).sum(axis=0) * of_mode).sum())
         lines = len(noise.lines) * (np.count_nonzero(samples) - noise.free)
         return float(samples.sum()) - free - lines
 
@@ -425,6 +427,14 @@ class NormalEquations:
             total[:, : self.n_pixels] += part[:, : self.n_pixels]
             total[:, self._ends[k] : self._ends[k + 1]] = part[:, self.n_pixels :]
         return total
+
+
+@kernel
+def add_to(out, at, values):  # type: ignore[no-untyped-def]
+    """Add values (n,) to pixels of a map, in their order; those beyond it are left out."""
+    for r in range(at.size):
+        if at[r] < out.size:
+            out[at[r]] += values[r]
 
 
 def inverse_of(weights: Floats) -> Floats:

@@ -111,10 +111,13 @@ def with_gradients(
 
 def noise_alone(rows: Floats, vectors: Floats) -> bool:
     """True if ``rows`` (n_det, n) have no pattern beside orthonormal ``vectors`` (k, n_det): with
-    columns of equal size, the leading one holds no more than that of white noise, (sqrt(n_det) +
-    sqrt(n))^2 times the variance (Marchenko & Pastur 1967).
+    detectors and columns of equal size, the leading one holds no more than that of white noise,
+    (sqrt(n_det) + sqrt(n))^2 times the variance (Marchenko & Pastur 1967).
     """
-    rest = rows - np.einsum("kd,kt->dt", vectors, np.einsum("kd,dt->kt", vectors, rows))
+    for _ in range(2):  # fitted alike, then by each detector's noise beside them
+        rest = rows - np.einsum("kd,kt->dt", vectors, np.einsum("kd,dt->kt", vectors, rows))
+        size = np.sqrt(np.maximum((rest**2).mean(axis=1, keepdims=True), TINY))
+        rows, vectors = rows / size, orthonormal(vectors / size.T, vectors[:0])
     rest /= np.sqrt(np.maximum((rest**2).mean(axis=0), TINY))
     first = leading(rest, 1, vectors[:0])
     edge = (np.sqrt(rest.shape[0]) + np.sqrt(rest.shape[1])) ** 2

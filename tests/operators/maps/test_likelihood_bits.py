@@ -120,6 +120,16 @@ def test_compressed_scans_have_the_same_bits_wherever_they_are(
     assert not list(temporary.iterdir())
 
 
+def test_campaigns_keep_their_runs(ample, tmp_path, monkeypatch):
+    """Partial products hold runs, also where a single run would find them anew."""
+    monkeypatch.setattr(Files, "hold", lambda self, size: False)
+    path, out = str(file_of(tmp_path, "{}")), tmp_path / "out"
+    engine = ["--engine", "serial", "--threads", "1", "--no-prune"]
+    assert cli.main(["run", path, "--output", str(out), *engine]) == 0
+    found, expected = zonda.read_map(out / "map.fits"), ample[1]["map"].signal
+    np.testing.assert_allclose(found.signal, expected, rtol=1e-6, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("polarized", "plate", "how"),
     [

@@ -656,3 +656,28 @@ def test_a_scan_of_which_little_counts_is_refused():
     o.flags[100:] = 2
     with pytest.raises(PipelineError, match="in 5 of the 17 baselines"):
         mapped(o, SIGMA * np.random.default_rng(15).normal(size=(5, 6000)))
+
+
+def test_the_noise_of_few_detectors_is_estimated_again_and_again():
+    """White noise of ten detectors: slow noise stays below 3 times white noise (bins of ten
+    detectors and a few frequencies scatter by 0.3).
+    """
+    o = scan(10, 6000, radius=3.0)
+    o.focalplane.net[:] = SIGMA / np.sqrt(o.sample_rate)
+    noise = SIGMA * np.random.default_rng(4).normal(size=(10, o.n_samples))
+    maker = MaximumLikelihoodMap(pixel="15 arcsec", half_difference=False, refine=3)
+    (model,) = run([maker], o, noise).products["noise_model"].models
+    assert model.own.max() < 3
+    assert model.shared[:, 1:].max() < 10
+
+
+def test_chi_square_where_most_samples_are_gaps():
+    """A free mode has one value at each instant, of gaps, too, which 63 % of 20 detectors' samples
+    are: chi^2 would be 0.9 if it had less."""
+    o = scan(20, 6000, radius=3.0)
+    o.focalplane.net[:] = SIGMA / np.sqrt(o.sample_rate)
+    noise = SIGMA * np.random.default_rng(1).normal(size=(20, o.n_samples))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # samples beyond the map
+        value, error = mapped(o, noise, width="5 arcmin").chi2
+    assert value == pytest.approx(1, abs=4 * error)

@@ -381,6 +381,12 @@ def test_the_first_mode_is_what_all_see_alike_unless_gains_differ():
     # the noise of a leading vector: 1 / (1e3 sqrt(n))
     np.testing.assert_allclose(found, gains * np.sqrt(n_det / (gains**2).sum()), atol=4e-4)
     assert np.ptp(first_of(white)) > 0.1
+    drifting = tilted.copy()
+    drifting[7] += 5 * rng.normal(size=n)
+    drifting[9:19] += 3 * rng.normal(size=(10, n))
+    np.testing.assert_allclose(first_of(drifting), 1)
+    alike[3] = tilted[3] = 0.0  # a detector without samples
+    np.testing.assert_allclose(first_of(tilted)[4:], np.sqrt(n_det / (n_det - 1)))
 
 
 @pytest.mark.parametrize("polarized", [False, True])
