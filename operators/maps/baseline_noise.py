@@ -8,13 +8,14 @@ In units of each detector's white level, with g = sigma^2 / L the white variance
 
 in which B spreads baselines over samples, and the free modes u (the first of the q_k) have no
 weight at any frequency, within baselines too. D and the spectra E_k of the modes are means over
-bins of frequency of the residual baselines' powers. The inverse of (2) is
+bins of frequency of the residual baselines' powers, D over the share that a map leaves of it. The
+inverse of (2) is
 
     1 / D (1 - sum_k h_k q_k q_k^T),   h_k = E_k / (D + E_k), 1 for a free mode.            (3)
 
 Q_b = Z g^(-1/2) (3) g^(-1/2) Z; Z takes a polynomial of each detector's scan off, fitted to the
-baselines that have samples; powers are those per such baseline. Any Q_b >= 0 makes an unbiased map;
-that of the noise itself makes the one of least noise.
+baselines that have samples; powers are those per such baseline. Any Q_b >= 0 that does not
+depend on the data makes an unbiased map; that of the noise itself makes the one of least noise.
 
 Closed forms of the scene (`of_scene`), in place of what streams show: what detectors share has the
 spectra S_de(f) = sum_w P_w(f) v_d v_e of waves w across the focal plane (`ClosedForm.across`), v
@@ -93,7 +94,8 @@ class BaselineNoise:
         (n_bins,) power of baselines without the modes, in units of white noise: D, but for its
         limit.
     fast
-        (n_det,) the same of each detector, in the upper half of the frequencies.
+        (n_det,) power of each detector's baselines without the modes, in units of white noise, in
+        the upper half of the frequencies.
     freedom
         (n_bins,) degrees of freedom of ``least``; 0 at the lowest frequencies, of which ``lines``
         take a part.

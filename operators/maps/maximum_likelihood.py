@@ -2,12 +2,14 @@
 
     m = (P^T Q P)^-1 P^T Q d                                                                 (1)
 
-is unbiased for any Q; the one of `baseline_noise` is the inverse covariance of the noise. A first
-reading of each scan compresses it (`compressed_scan`) and estimates its noise, a second one adds up
-what free modes take. `normal_equations` are then solved without the streams.
+is unbiased for any Q that does not depend on d; the one of `baseline_noise` is the inverse
+covariance of the noise. A first reading of each scan compresses it (`compressed_scan`) and
+estimates its noise, a second one adds up what free modes take. `normal_equations` are then solved
+without the streams.
 
 After the first solution the noise is estimated anew from baselines minus those of the map
-(`refine`); free modes stay what they are, so that no reading is needed.
+(`refine`), of which a map of a draw of the noise tells how much is left; free modes stay what they
+are, so that no reading is needed.
 """
 
 from __future__ import annotations
