@@ -5,7 +5,7 @@ off them.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -34,6 +34,8 @@ from .undetermined import TINY, Patterns, undetermined
 
 MOST_ITERATIONS = 1000
 """Iterations of conjugate gradients at most."""
+TEMPLATE = 1e-8
+"""Tolerance of the weights of templates where other bands' maps, or gaps, are unknown."""
 POOR = 1e-2
 """Ritz value of a pattern whose noise is ten times white noise."""
 
@@ -60,6 +62,7 @@ class LikelihoodSystem:
     scans: CompressedScans
     data: Data
     work: Work = field(default_factory=Work)
+    weighed: dict[int, tuple[Floats, list[Floats]]] = field(default_factory=dict)
     _solutions: dict[tuple[str, int | None], Solution] = field(default_factory=dict)
 
     @cached_property
@@ -141,15 +144,20 @@ class LikelihoodSystem:
             self._solutions[key] = found
         return found
 
-    def _solve(self, equations: NormalEquations, right: Floats, what: str) -> Solution:
-        """The solution of a right side; ``what`` progress calls it."""
-        step, told = self.parameters, [0]
+    def progress(self, what: str, tolerance: float) -> Callable[[float], None]:
+        """Shows how far a residual is on its way to the tolerance."""
+        told = [0]
 
         def tell(residual: float) -> None:
-            share = np.log(max(residual, step.tolerance)) / np.log(step.tolerance)
-            told[0] = max(told[0], int(100 * share))
-            self.data.progress(told[0], 100, f"{step.label}: iterations, {what}")
+            told[0] = max(told[0], int(100 * np.log(max(residual, tolerance)) / np.log(tolerance)))
+            self.data.progress(told[0], 100, f"{self.parameters.label}: iterations, {what}")
 
+        return tell
+
+    def _solve(self, equations: NormalEquations, right: Floats, what: str) -> Solution:
+        """The solution of a right side; ``what`` progress calls it."""
+        step = self.parameters
+        tell = self.progress(what, step.tolerance)
         return equations.solve(right, step.tolerance, MOST_ITERATIONS, tell=tell)
 
     def right_side(
@@ -293,7 +301,18 @@ class LikelihoodMaps(MapFromSums):
 
         the weights of t beside unknown amplitudes of P. A' P = 0.
         """
-        weights, patterns = self._apply(t), np.zeros((len(self._patterns), *t.shape))
+        weights = self._apply(t)
+        for one, product_of in zip(*self._weighed_patterns(t.shape, product), strict=True):
+            weights -= float((one * weights).sum()) * product_of
+        return weights
+
+    def _weighed_patterns(
+        self, shape: tuple[int, ...], product: MapProduct
+    ) -> tuple[Floats, list[Floats]]:
+        """Patterns P that are taken off, with P^T A P = 1, and A P; the same for all signals."""
+        if self.band in self.system.weighed:
+            return self.system.weighed[self.band]
+        patterns = np.zeros((len(self._patterns), *shape))
         patterns[:, 0, self._seen] = np.where(
             product.known.ravel(), self._patterns[:, self._seen], 0
         )
@@ -309,8 +328,8 @@ class LikelihoodMaps(MapFromSums):
             unit = 1 / np.sqrt(size) if size > least else 0.0
             one *= unit
             products[k] = products[k] * unit
-            weights -= float((one * weights).sum()) * products[k]
-        return weights
+        self.system.weighed[self.band] = patterns, products
+        return patterns, products
 
     def _apply(self, m: Floats) -> Floats:
         """A m of a map (n_stokes, n_pixels), A the information of this band's map beside those of
@@ -319,7 +338,8 @@ class LikelihoodMaps(MapFromSums):
         equations = self.system.equations
         whole = np.zeros((len(m), equations.n_pixels))
         whole[:, self._own] = m
-        return equations.apply(whole, self._own)[:, self._own]
+        tell = self.system.progress("weights of templates", TEMPLATE)
+        return equations.apply(whole, self._own, TEMPLATE, tell)[:, self._own]
 
     def _half(self, stream: str, half: int, product: MapProduct) -> tuple[Floats, Floats]:
         """The map of the even or odd scans, and its inverse weights (n_stokes, n_pixels)."""

@@ -306,19 +306,25 @@ class NormalEquations:
 
         return self._sum(one)
 
-    def apply(self, m: Floats, own: slice = slice(None)) -> Floats:
-        """P^T Q P m, Q of the samples that count; ``own``: as of `eliminated`."""
-        return self.eliminated(self._product(self._widened(m)), own)
+    def apply(self, m: Floats, own: slice = slice(None), *how: Any) -> Floats:
+        """P^T Q P m, Q of the samples that count; ``own``, ``how``: as of `eliminated`."""
+        return self.eliminated(self._product(self._widened(m)), own, *how)
 
-    def eliminated(self, right: Floats, own: slice = slice(None)) -> Floats:
+    def eliminated(
+        self,
+        right: Floats,
+        own: slice = slice(None),
+        tolerance: float = EXACT,
+        tell: Callable[[float], None] = lambda residual: None,
+    ) -> Floats:
         """A right side, or a product, of the pixels ``own`` of the map alone (n_stokes, n_pixels):
         gaps, and other pixels, are solved for by conjugate gradients, and what they make of the map
-        is taken off.
+        is taken off. ``tolerance``, ``tell``: as of `solve`.
         """
         inverse = self._inverse.copy()
         inverse[:, : self.n_pixels][:, own] = 0.0
         if inverse.any():
-            others = self.solve(right, EXACT, MOST, inverse)
+            others = self.solve(right, tolerance, MOST, inverse, tell)
             values = np.concatenate([others.values, others.gaps], axis=1)
             right = right - self._product(values)
         return right[:, : self.n_pixels]
