@@ -221,7 +221,9 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         if lost:
             log.state(self.label, "samples of the last baseline, which is shorter", str(lost))
         powers = ", ".join(f"{value:.3g}" for value in noise.values)
-        log.state(self.label, "power of modes over white noise", powers or "no modes")
+        log.state(
+            self.label, "power of modes over white noise, first estimate", powers or "no modes"
+        )
 
     @property
     def _where(self) -> str:

@@ -275,7 +275,8 @@ class LikelihoodParameters(MapParameters):
         if "free" not in self.model_fields_set:
             self.__dict__["free"] = min(self.free, self.modes)
         if self.free > self.modes:
-            raise ValueError(f"free: {self.free} of {self.modes} modes; set modes to {self.free}")
+            text = f"free: {self.free} of {self.modes} modes"
+            raise ValueError(f"{text}; set free to {self.modes} or less, or modes to {self.free}")
         if self.contents == "hits" or self.weights == "uniform":
             raise ValueError(
                 "contents: hits and weights: uniform belong to BinMap: these maps are weighted by"
