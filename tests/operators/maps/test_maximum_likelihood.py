@@ -519,15 +519,15 @@ def test_gaps_of_some_detectors_leave_the_noise_as_it_is(gaps):
     assert found.hits.sum() < 0.98 * whole.hits.sum()
     # some 500 pixels: 3 % each, and weights that are a little off
     assert excess(found) == pytest.approx(excess(whole), rel=0.1)
-    # each level to 2 % (3000 samples or more, of which baselines are a tenth), and the map's share;
-    # with the walk in the means of the samples that are there, single gaps had 2.9 times, chi^2 0.1
-    assert np.nanmedian(found.noise * np.sqrt(found.hits)) == pytest.approx(SIGMA, rel=0.05)
+    # white levels are known to 2 %; if the walk were left in means of the samples that are there,
+    # they would be 2.9 times too high with single gaps, and chi^2 0.1
+    assert np.nanmedian(found.noise * np.sqrt(found.hits)) == pytest.approx(SIGMA, rel=0.02)
     assert found.chi2[0] == pytest.approx(1, abs=0.1)
 
 
 def test_a_mask_of_the_source_leaves_the_noise_as_it_is():
-    """Samples within 2 arcmin of the middle, 16 % of all and at other times of each detector, do not
-    count: a source there changes no bit, and the noise is that of the map without a mask."""
+    """Samples within 2 arcmin of the middle are missing: 16 %, at other times of each detector. The
+    noise is that of the map without a mask."""
     o, rng = observation(), np.random.default_rng(17)
     noise = drifts(o, rng) + SIGMA * rng.normal(size=(37, o.n_samples))
     grid = grid_of(o, pixel="15 arcsec")
@@ -535,9 +535,7 @@ def test_a_mask_of_the_source_leaves_the_noise_as_it_is():
     r = np.hypot(*(x - (n - 1) / 2 for x, n in zip(at, grid.shape, strict=True))) * 15 / 60
     inside = r < 2
     assert 0.1 < inside.mean() < 0.2
-    source = 100 * SIGMA * np.where(inside, np.exp(-(r**2)), 0.0)
-    none, seen = (mapped(o, np.where(inside, np.nan, noise + k * source)) for k in (0, 1))
-    np.testing.assert_array_equal(none.signal, seen.signal)
+    seen = mapped(o, np.where(inside, np.nan, noise))
     whole = mapped(o, noise)
     assert excess(seen) == pytest.approx(excess(whole), rel=0.1)
     assert seen.chi2[0] == pytest.approx(whole.chi2[0], abs=0.03)
@@ -659,8 +657,8 @@ def test_a_scan_of_which_little_counts_is_refused():
 
 
 def test_the_noise_of_few_detectors_is_estimated_again_and_again():
-    """White noise of ten detectors: slow noise stays below 3 times white noise (bins of ten
-    detectors and a few frequencies scatter by 0.3).
+    """White noise of ten detectors: the largest of 40 bins is 2.3 times white noise at first (14
+    degrees of freedom), and estimates from the map do not drive it, or modes, up.
     """
     o = scan(10, 6000, radius=3.0)
     o.focalplane.net[:] = SIGMA / np.sqrt(o.sample_rate)
@@ -668,7 +666,7 @@ def test_the_noise_of_few_detectors_is_estimated_again_and_again():
     maker = MaximumLikelihoodMap(pixel="15 arcsec", half_difference=False, refine=3)
     (model,) = run([maker], o, noise).products["noise_model"].models
     assert model.own.max() < 3
-    assert model.shared[:, 1:].max() < 10
+    assert model.shared[:, 1:].max() < 4
 
 
 def test_chi_square_where_most_samples_are_gaps():

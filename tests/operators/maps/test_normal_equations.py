@@ -356,9 +356,9 @@ def test_gradients_stand_beside_free_modes_in_every_estimate(free):
             inside = np.linalg.qr(np.stack([np.ones(n_det), *patterns, x, y]).T)[0]
             assert ((found @ inside) ** 2).sum(axis=1).min() > 1 - 1e-4
             if not patterns and free == 2:
-                # noise turns the axes by about 9 n_det / (power of y sqrt(n)): 0.1
+                # noise turns the axes by 3 / sqrt(n sum y^2): 0.03
                 side = found[1] - found[1].mean()
-                assert abs(np.corrcoef(side, y)[0, 1]) > 0.95
+                assert abs(np.corrcoef(side, y)[0, 1]) > 0.99
 
 
 def test_the_first_mode_is_what_all_see_alike_unless_gains_differ():
@@ -435,8 +435,10 @@ def test_what_a_map_takes_of_the_noise_is_given_back():
         y, rest = less_its_map(2 * k + 1, model)
         left.append(what_remains(rest, y, scan.counted, found[-1]))
     size = np.array([one.least for one in found])
-    error = np.hypot(size.std(axis=0), np.std(left, axis=0) * size.mean(axis=0)) / np.sqrt(200)
+    relative = [np.std(x, axis=0) / np.mean(x, axis=0) for x in (size, left)]
+    error = np.hypot(*relative) / np.sqrt(200)
     ratio = size.mean(axis=0) / np.mean(left, axis=0) / 1.5
     assert size.mean(axis=0).min() < 0.8 * 1.5
-    # the share changes slowly with the model: by less than 6 %
-    np.testing.assert_allclose(ratio, 1, atol=0.06 + 4 * error.max())
+    # the share is that of a wrong model, and pooled over bins; without it the lowest two bins are
+    # 20 % too low
+    np.testing.assert_array_less(np.abs(ratio - 1), 0.06 + 4 * error)
