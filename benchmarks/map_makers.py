@@ -216,7 +216,7 @@ def compare(kind: str, seed: int, again: Sequence[int], baseline: str | None) ->
 
 
 PLACES = ((0, 0), (30, 30), (-30, 30), (30, -30))
-"""Of the cluster in rows and columns."""
+"""Shifts of the cluster in rows and columns."""
 
 
 def variance(w: Any, scan: Any, white: float) -> float:

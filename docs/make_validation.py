@@ -19,8 +19,8 @@ STORED = Path(__file__).with_name("validation.ecsv")
 PAGE = Path(__file__).with_name("validation.md")
 LIMIT = 2.0
 """Distance up to which a claim agrees (`zonda.plugins.validation.claims.LIMIT`)."""
-RUN = "of one run, 8 min on two busy cores"
-"""Of which run the table is."""
+RUN = "from one run, 8 min on two busy cores"
+"""The run that the table is from."""
 
 HEAD = r"""# What the paper states, measured again
 
