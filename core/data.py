@@ -64,7 +64,7 @@ class Data:
     band: str = ""
     """Name of the band that these are the data of, where the camera has several."""
     n_bands: int = 1
-    """Bands of the camera."""
+    """Bands of the camera that this is one of (`band`); 1 in the data of the whole camera."""
     bands: dict[str, Data] = field(default_factory=dict, repr=False)
     """By name, the data of each band of a camera with several: its scans, and its products under
     the names that they have in a camera of one band.

@@ -74,7 +74,7 @@ def kernel(
 
 
 contracted = kernel(fastmath={"contract", "nsz"})
-"""`kernel` that may fuse products with sums, and takes -0 for 0; it takes further options, too."""
+"""`kernel` with fused multiply-add and without signed zeros; it takes the other options, too."""
 
 
 @functools.cache

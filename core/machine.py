@@ -1,5 +1,5 @@
 """This machine and this process: memory, threads, the processor, the user's cache folder, processes
-that zonda starts, and installed packages.
+that zonda starts, installed packages and their versions, and a hash of zonda's own code.
 """
 
 from __future__ import annotations
@@ -248,16 +248,16 @@ def _version(package: str) -> str | None:
 
 
 @cache
-def fingerprint() -> str:
+def code_hash() -> str:
     """Hash of the names, times and sizes of zonda's own files."""
     digest = hashlib.blake2b(digest_size=16)
-    for folder in folders():
+    for folder in _code_folders():
         for path, stat in sorted(_files(folder)):
             digest.update(f"{path} {stat.st_mtime_ns} {stat.st_size}\n".encode())
     return digest.hexdigest()
 
 
-def folders() -> Iterator[str]:
+def _code_folders() -> Iterator[str]:
     """Folders of zonda's own modules."""
     for package in ("core", "operators", "plugins"):
         spec = find_spec(f"{HOST}.{package}")

@@ -5,18 +5,16 @@ bands together, and the step that adds up what is calibrated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from pydantic import PrivateAttr
 
 from .block import Block
+from .data import Data
 from .numerics.smooth import FieldSums
 from .operator import Operator
 from .output import Output
 from .signal import MAIN, Component, is_stream
-
-if TYPE_CHECKING:
-    from .data import Data
 
 
 class MapMaker(Operator):

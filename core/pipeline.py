@@ -387,6 +387,8 @@ class Pipeline:
     def _finish(self, data: Data, bands: Sequence[Band], timer: Timer) -> None:
         """Finish the products of all bands, and let the outputs act."""
         for band in bands:
+            self._subtract_remainders(band.data)
+        for band in bands:
             self._make_products(band, bands, timer)
             if data.bands:
                 self._let_outputs_act(band.operators, band.data, timer)
@@ -399,19 +401,19 @@ class Pipeline:
         data.provenance["timings"] = timer.rows()
         manager().hook.zonda_pipeline_end(pipeline=self, data=data)
 
-    def _make_products(self, band: Band, bands: Sequence[Band], timer: Timer) -> None:
-        """Subtract the remainders, and finish all products; those of a map maker that joins bands
-        with the first one.
-        """
-        data = band.data
+    def _subtract_remainders(self, data: Data) -> None:
+        """Make partial products of remainders, which are not simulated."""
         for name, parts in self.signals.remainders.items():
             for product in data.partial.values():
                 if product.signals and stream_of(name) not in product.signals:
                     product.subtract(stream_of(name), [stream_of(part) for part in parts])
             data.log.state(name, "remainder", remainder(parts))
+
+    def _make_products(self, band: Band, bands: Sequence[Band], timer: Timer) -> None:
+        """Finish all products of a band; those of a map maker that joins bands with the first."""
         for operator in band.chain.steps:
             if len(bands) == 1 or not (isinstance(operator, MapMaker) and joins(operator)):
-                self._timed(timer, operator, "finalize", data)
+                self._timed(timer, operator, "finalize", band.data)
             elif band is bands[0]:
                 self._timed(timer, operator, "finalize_bands", [one.data for one in bands])
 

@@ -238,7 +238,7 @@ class Changed:
     @classmethod
     def of(cls, values: Floats, stream: Stream, fixed: SmoothField | None = None) -> Changed:
         """Take the whole (n_det, n_samp), which is used up. The mean of ``stream`` stays beside it
-        where it is nearer than zero; ``fixed``: one that others have, and that stays."""
+        where it is nearer than zero; ``fixed``: a mean that other signals share; it is kept."""
         mean = stream.means.get(stream.name)
         observation = stream.observation
         if mean is not None and not _is_left(values, mean, observation):

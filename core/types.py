@@ -11,5 +11,8 @@ Floats = NDArray[np.float64]
 AnyFloats = NDArray[np.floating[Any]]
 """float32 or float64."""
 Bools = NDArray[np.bool_]
+"""bool."""
 Integers = NDArray[np.int64]
+"""int64."""
 Indices = NDArray[np.intp]
+"""intp: numbers of rows, detectors or samples."""

@@ -272,7 +272,7 @@ def filters(pipeline: Steps, observation: Observation, modes: Any = None) -> Fil
 
 def modes(pipeline: Steps, observation: Observation, stream: Floats) -> dict[str, Any]:
     """Find the modes of singular filters in a stream (n_det, n_samp) [K_RJ], by label, as
-    `filters` takes them. Those before act on the stream as they do in a run. Detectors that
+    `filters` takes them. Filters before them act on the stream as they do in a run. Detectors that
     they find dead have no part in the modes; the scan itself is not flagged.
     """
     return Filters(pipeline, observation, {}).found(stream)

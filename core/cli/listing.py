@@ -1,5 +1,5 @@
-"""Names of what there is (``zonda plugins``, ``pipelines``, ``schema``) and their completion by a
-shell, without importing components.
+"""Lists of components (``zonda plugins``, ``pipelines``, ``schema``), and ``zonda completion``: the
+names that a shell completes, without importing components.
 """
 
 from __future__ import annotations

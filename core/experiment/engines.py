@@ -179,8 +179,10 @@ def engine(
 
     Raises
     ------
+    InputError
+        A package is missing.
     PipelineError
-        Where a package is missing, or the scheduler of Dask is not named or cannot be reached.
+        MPI has one process, or the scheduler of Dask is not named or cannot be reached.
     """
     if name == "processes":
         return _processes(workers, threads, memory)

@@ -147,9 +147,9 @@ class FileVariant:
         """Hash of all that its values depend on: every parameter, input files, and the sources of
         zonda and of the plugins whose steps it has.
         """
-        from ..machine import fingerprint
+        from ..machine import code_hash
 
-        found = hashlib.blake2b(fingerprint().encode(), digest_size=12)
+        found = hashlib.blake2b(code_hash().encode(), digest_size=12)
         found.update(self.file.resolved_yaml().encode())
         for module in sorted({type(o).__module__ for o in self.file.operators}):
             with suppress(OSError, AttributeError, TypeError):

@@ -91,7 +91,7 @@ def _plane(product: MapArrays, size: int) -> tuple[Any, tuple[int, int]]:
 
 
 NOISE_MODELS = {"net": "simulated", "streams": "estimated", "table": "table"}
-"""NOISEMOD of headers: of a maximum-likelihood map, by what its white noise comes from."""
+"""FITS values of NOISEMOD, the noise model of a maximum-likelihood map, by `noise_from`."""
 
 
 @dataclass(init=False)
@@ -143,8 +143,8 @@ class MapArrays:
     sample_rate
         Of all scans [Hz]; 0 where it is unknown or they differ.
     noise_from
-        Origin of the white noise: NETs, the scatter of samples, or of a maximum-likelihood map the
-        streams or a table.
+        Origin of the white noise: ``net``, or ``scatter`` of samples; of a maximum-likelihood map
+        also ``streams`` or ``table``.
     contents
         ``hits``: nothing else was made, ``signal`` and ``noise`` are NaN.
     scan_hits

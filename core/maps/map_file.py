@@ -236,7 +236,7 @@ class MapFile:
             cards.append(("CHI2", chi2[0], "of samples minus map, per degree of freedom"))
             cards.append(("CHI2ERR", chi2[1], "standard error, if noise is as modelled"))
             model = NOISE_MODELS[self.product.noise_from]
-            cards.append(("NOISEMOD", model, "where the noise model comes from"))
+            cards.append(("NOISEMOD", model, "origin of the noise model"))
         if (index := self.product.spectral_index) is not None:
             cards.append(("SPECINDX", index, "of the flux density, for the unit: at RESTFRQ"))
         return header_of(cards, about.history)

@@ -1,5 +1,5 @@
-"""From ICRS to the horizon and back for a whole scan, exact at coarse time nodes, interpolated
-between them; the Earth's orientation.
+"""Transforms between ICRS and the horizon for a whole scan, exact at coarse time nodes and
+interpolated between them; and the Earth's orientation (UT1-UTC, polar motion).
 
 An ICRS direction p becomes the horizontal direction h at time t by
 

@@ -38,7 +38,7 @@ SAMPLES = 2e7
 
 SHORTER = 4
 TIMES = 2
-FEW = 32
+COUNTED_DETECTORS = 32
 """Detectors over the whole first scan, in which work is counted, beside the outermost four."""
 LEAST_SECONDS = 4.0
 """Length of the timed slice before detectors are left out, s."""
@@ -130,13 +130,15 @@ def timed(
     seconds = min(max(SAMPLES / rate, LEAST_SECONDS, SHORTER * least), SECONDS, first.duration)
     every = max(1, math.ceil(seconds * rate / SAMPLES))
     shorter = min(max(seconds / SHORTER, least), seconds)
-    brief = _with(file, {label: planning.brief for label, planning in steps.items()})
+    brief = _with_operators(file, {label: planning.brief for label, planning in steps.items()})
     less, short = _least(brief, Slice(seconds=shorter, every=every), outputs=False)
     part, long = _least(brief, Slice(seconds=seconds, every=every), outputs=True)
-    cut = Slice(seconds=first.duration, every=max(first.n_detectors // FEW, 1))
+    cut = Slice(seconds=first.duration, every=max(first.n_detectors // COUNTED_DETECTORS, 1))
     for label, step in steps.items():
         if (counted := step.counted(observations)) is not None:
-            step.whole = _least(_with(file, {label: counted}), cut, outputs=False, times=1)[0]
+            step.whole = _least(
+                _with_operators(file, {label: counted}), cut, outputs=False, times=1
+            )[0]
     few, many, samples = (
         samples_in(o) for o in (less.observations, part.observations, observations)
     )
@@ -157,7 +159,7 @@ def timed(
     return Timing(setup, growing, words, basis)
 
 
-def _with(file: PipelineFile, operators: Mapping[str, Operator]) -> PipelineFile:
+def _with_operators(file: PipelineFile, operators: Mapping[str, Operator]) -> PipelineFile:
     """The pipeline with other ``operators`` of the same labels."""
     labels = [o.label for o in file.pipeline().operators]
     steps = [

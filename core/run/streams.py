@@ -184,7 +184,7 @@ class Files:
 
     room: int
 
-    def hold(self, size: int) -> bool:
+    def fits(self, size: int) -> bool:
         """Tell whether ``size`` bytes of a product fit in memory or on the disk."""
         return size <= max(self.room, free_disk())
 

@@ -30,7 +30,7 @@ from . import files
 
 RECORD = "zonda-files.jsonl"
 LOCK = ".zonda-lock"
-LONGEST = 64_000_000
+RECORD_MAX = 64_000_000
 """Bytes of a record that are read."""
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
 
@@ -183,7 +183,7 @@ def _read(folder: Path) -> dict[str, set[Stamp]]:
     found: dict[str, set[Stamp]] = {}
     try:
         with open(files.open_own(folder / RECORD, os.O_RDONLY), "rb") as file:
-            lines = file.read(LONGEST).splitlines()
+            lines = file.read(RECORD_MAX).splitlines()
     except FileNotFoundError:
         return {}
     for line in lines:

@@ -38,7 +38,7 @@ does not double amplitudes.
 MODES = 4
 """Modes whose streams are drawn."""
 PER_DECADE = 24
-"""Bins of a spectrum."""
+"""Bins of a drawn spectrum per decade of frequency."""
 
 
 def _binned(

@@ -17,8 +17,8 @@ Q_b = Z g^(-1/2) (3) g^(-1/2) Z; Z takes a polynomial of each detector's scan of
 baselines that have samples; powers are those per such baseline. Any Q_b >= 0 that does not
 depend on the data makes an unbiased map; that of the noise itself makes the one of least noise.
 
-Closed forms of the scene (`of_scene`), in place of what streams show: what detectors share has the
-spectra S_de(f) = sum_w P_w(f) v_d v_e of waves w across the focal plane (`ClosedForm.across`), v
+`of_scene` takes the noise from closed forms of the scene: what detectors share has the spectra
+S_de(f) = sum_w P_w(f) v_d v_e of waves w across the focal plane (`ClosedForm.across`), v
 the cosine and the sine of a wave over the white level of a detector, and the part of pink noise
 that all have in common. In equation (2) then
 
@@ -58,11 +58,11 @@ SLOW = 1.0
 FEWEST = 8
 """Frequencies that modes are found in at least."""
 POOLED = np.ones(9)
-"""Weights of neighbouring bins, of which a share is that of the sum."""
+"""Weights with which neighbouring bins are added up for the share that a map leaves."""
 FILLS = 40
 """Steps of the fit that fills baselines: what is left falls by the share of them that lack."""
 LEAST_LEFT = 0.1
-"""Share of a detector's white noise that modes leave, from which its level is told."""
+"""Smallest share of a detector's white noise beside the modes from which its level is corrected."""
 WAVES, ANGLES = 60, 12
 """Wave numbers across the focal plane, and directions of half a turn, isotropic in the mean."""
 EVEN = 1e-5

@@ -78,15 +78,13 @@ class LikelihoodSystem:
         step, first = self.parameters, self.parts[0][2].first
         for turn in range(step.refined):
             solution = self._solve(found, self.right_side(found, first), "noise")
-            drawn = self._solve(found, found.drawn(turn), "noise, a draw")
+            remains = self._remains(found, turn)
             scans = []
             for k, (one, (scan, noise)) in enumerate(
                 zip(self.scans.scans, found.scans, strict=True)
             ):
-                y, of_draw = one.data[first][0], found.draw(turn, k)[1]
-                rest = of_draw - found.baselines(drawn, k)
                 new = estimate(
-                    y - found.baselines(solution, k),
+                    one.data[first][0] - found.baselines(solution, k),
                     scan.counted,
                     noise.white,
                     scan.length,
@@ -98,13 +96,27 @@ class LikelihoodSystem:
                     lacking=scan.lacking,
                     groups=noise.groups,
                     places=noise.places,
-                    remains=what_remains(rest, of_draw, scan.counted, noise),
+                    remains=remains[k],
                 )
                 if step.noise != "estimated":
-                    new = replace(new, own=noise.own)  # that of a table
+                    new = replace(new, own=noise.own)
                 scans.append(WeighedScan(scan, new))
             found = self._of(scans)
         return found
+
+    def _remains(self, found: NormalEquations, turn: int) -> Sequence[Floats | None]:
+        """Shares of the detectors' own noise that a map leaves, of each scan, from a draw; None
+        where it is not estimated. The draw is made again for its baselines, which would take 8
+        bytes each.
+        """
+        if self.parameters.noise != "estimated":
+            return [None] * len(found.scans)
+        drawn, shares = self._solve(found, found.drawn(turn), "noise, a draw"), []
+        for k, (scan, noise) in enumerate(found.scans):
+            y = found.draw(turn, k)[1]
+            rest = y - found.baselines(drawn, k)
+            shares.append(what_remains(rest, y, scan.counted, noise))
+        return shares
 
     @cached_property
     def equations_of_halves(self) -> list[NormalEquations]:
@@ -145,7 +157,7 @@ class LikelihoodSystem:
         return found
 
     def progress(self, what: str, tolerance: float) -> Callable[[float], None]:
-        """Shows how far a residual is on its way to the tolerance."""
+        """Make the function that shows how far a residual is on its way to the tolerance."""
         told = [0]
 
         def tell(residual: float) -> None:

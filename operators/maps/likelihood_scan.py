@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from zonda.core.detector_files import NoiseTable
 
 STEPS = 3
-"""Of the search for what detectors have in common within baselines of which samples lack."""
+"""Steps of the search for what detectors have in common, where baselines lack samples."""
 FILLED, STILL = 60, 1e-6
 """Searches at most for the mode that fills baselines, and the change below which they end."""
 MOST_APART = 1e4
@@ -290,9 +290,8 @@ class LikelihoodScan:
         )
 
     def steady(self, white: Floats) -> Floats:
-        """(n, n_base) means of baselines, K. Where samples of some detectors lack, without what the
-        part that detectors of a group have in common, with the gains of the mode that `filler` is,
-        differs in the others from its mean over the baseline.
+        """(n, n_base) means of baselines, K. Where a baseline lacks samples, its mean is corrected
+        for what the common mode of the group, with the gains of `filler`, did in them.
         """
         scan, y, gain = self.scan, self.found.means, self.filler * np.sqrt(white)
         starts = np.arange(scan.shape[1]) * self.length

@@ -82,7 +82,7 @@ class MaximumLikelihoodMap(LikelihoodParameters, BinMap):
         if data.files is not None and every:
             planning: Any = planning_of(self)
             longest = max(data.observations, key=lambda o: o.n_detectors * o.n_samples)
-            if not (data.laid_out or data.files.hold(planning.compressed(longest))):
+            if not (data.laid_out or data.files.fits(planning.compressed(longest))):
                 self._keeps = Keeps.AGAIN  # partial products of a campaign hold their runs
             size, place = planning.compressed(longest), f"{self.label}, compressed scans"
             self._in_files = data.files.needed(size, place, planning.smaller)

@@ -198,7 +198,8 @@ class Solution(NamedTuple):
 
 @dataclass
 class Work:
-    """Products with equation (1), right sides among them, and CPU seconds of their scans."""
+    """Products with equation (1), right sides of the data among them, and CPU seconds of their
+    scans."""
 
     products: int = 0
     seconds: float = 0.0

@@ -220,7 +220,7 @@ class LikelihoodParameters(MapParameters):
 
     largest_pixel = (
         0.5,
-        "what varies within a pixel is taken for noise, and spread over the map (0.2 to 2 % of the"
+        "what varies within a pixel is taken for noise, and spread over the map (0.4 to 3 % of the"
         " sky's rms at half of the beam, 7 % with modes: 0)",
     )
     baseline: Seconds | None = Field(None, gt=0, examples=["0.2 s"])
@@ -261,8 +261,8 @@ class LikelihoodParameters(MapParameters):
     def _no_mask(cls, values: Any) -> Any:
         if isinstance(values, dict) and "mask" in values:
             raise ValueError(
-                "a mask belongs to filters: nothing is filtered here, and the noise is estimated"
-                " from data minus the map (refine)"
+                "leave mask out: it belongs to filters, and nothing is filtered here; the noise is"
+                " estimated from data minus the map (refine)"
             )
         return values
 

@@ -220,7 +220,7 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
             "each scan is read twice: for runs, baselines and noise; for sums and free modes",
             f"compressed scans take {size / 1e9:.3g} GB {where}, with baselines of"
             f" {step.baseline_of(longest):.3g} s, {kept}",
-            f"{self._solutions(longest)} solutions by conjugate gradients, {2 * step.refined} of"
+            f"{self._solutions(longest)} solutions by conjugate gradients, {self._estimates} of"
             " them for the noise",
         ]
 
@@ -278,7 +278,12 @@ class MaximumLikelihoodPlanning(BinMapPlanning):
         """Solutions over all samples; two halves are one."""
         step = self.operator
         signals = len({*observation.signals} - observation.unfiltered)
-        return 2 * step.refined + signals * (1 + bool(step.half_difference))
+        return self._estimates + signals * (1 + bool(step.half_difference))
+
+    @property
+    def _estimates(self) -> int:
+        """Solutions for the noise: the map, and that of a draw."""
+        return self.operator.refined * (1 + (self.operator.noise == "estimated"))
 
     def sweeps(self, observation: Observation) -> int:
         """One reading finds runs and baselines."""

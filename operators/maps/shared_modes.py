@@ -17,7 +17,7 @@ CLEAR = 2.0
 """Power of what all detectors see alike over the mean over directions, from which it is a mode."""
 PATTERN = 1.4
 """Power of a leading vector over that of noise, from which it is a pattern: beside gradients it is
-0.98 to 1.04 for MUSTANG-2, and 1.8 for AtLAST, whose focal plane waves cross within a second."""
+0.98 to 1.04 for MUSTANG-2, and 1.8 for AtLAST, whose focal plane is not small beside the waves."""
 TINY = 1e-300
 ITERATIONS = 40
 """Products with the covariance in the search for its leading modes."""

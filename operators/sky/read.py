@@ -3,8 +3,8 @@ tables.
 
 Nothing is guessed: where the unit, the scale or the position is neither in the file nor given, the
 error lists the header keys and the parameters that would mend it. Arrays that are given in Python
-(numpy's, astropy quantities, FITS units in memory) become the unit of a FITS file that would hold
-them, so that everything behind it is the same: units, beams, projections, missing pixels.
+(numpy's, astropy quantities, HDUs in memory) become the HDU of a FITS file that would hold them, so
+that everything behind it is the same: units, beams, projections, missing pixels.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ IN_A_FILE = (
 GIVEN = "ZARRAY"
 """FITS key of a file that an array was written to: `ArrayMap.text`."""
 STOKES_AXIS = {"CTYPE3": "STOKES", "CRPIX3": 1.0, "CRVAL3": 1.0, "CDELT3": 1.0}
-"""Three images without a header are I, Q and U."""
+"""Keys of an array of three images without a header: I, Q and U."""
 TYPES = ("uint8", "int16", "int32", "int64", "float32", "float64")
 """Types of numbers that FITS has."""
 

@@ -40,9 +40,11 @@ beyond, a scan is refused.
 
 _DEGREES = (4, 6, 8, 11, 15, 20, 28, 40)
 
-_WIDER, _NARROWEST = 0.05, 1e-5
-"""Share by which the ranges of the polynomials reach beyond what the rim of the field spans; least
-sine of the elevation: axes beyond the ends of a scan are unit vectors but for 1e-6.
+_WIDER = 0.05
+"""Share by which the ranges of the polynomials reach beyond what the rim of the field spans."""
+_NARROWEST = 1e-5
+"""Least reach beyond, in sines of the elevation: axes beyond the ends of a scan are unit vectors to
+1e-6.
 """
 
 

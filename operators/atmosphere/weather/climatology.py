@@ -36,8 +36,9 @@ CLIMATOLOGY = Path(__file__).parent.parent / "data" / "climatology.npz"
 YEARS = (1940, 2100)
 """Years for which the climatology, of 15 recent ones, is taken: ERA5 begins with the first."""
 HOURS = tuple(range(0, 24, 3))
-"""UTC."""
+"""Hours (UTC) of `pwv_by_month`."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Quantiles of the PWV in `PwvByMonth`."""
 MONTHS = ("Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec")
 
 

@@ -395,8 +395,8 @@ def _layer_mean(pressure: Floats, mixing_ratio: Floats) -> Floats:
 
 
 def pwv_steps(profile: Profile) -> list[float]:
-    """The PWVs [m] for which spectra are shown: the profile's own among round values from very dry
-    to very wet there.
+    """PWVs [m] at which spectra are shown: the profile's own, among round values from very dry to
+    very wet there.
     """
     law = profile.distribution
     if not profile.pwv > 0:
